@@ -77,7 +77,8 @@ _GRAVITY_OF_LEVEL_CAMERA: Array = np.array([0.0, 9.81, 0.0])
 """Gravity in m/s^2 in the frame of a level camera, whose y axis points down.  It is assumed for the first
 camera if the first IMU samples cannot measure gravity, because the camera moved."""
 _DEFAULT_DEPTH_M = 2.0
-"""Median depth in metres that is assumed for a frame without depth, to compute the noise of positions."""
+"""Median depth in metres that is assumed when the last frame of a tracker with depth has no feature with
+depth, to compute the noise of positions for the IMU."""
 
 
 def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float | None = None) -> AskPose:

@@ -55,14 +55,16 @@ __all__ = [
 ]
 
 _MAX_FOUND_FEATURES = 100_000
-"""Largest number of features that a user's extractor may return for one image: bounds time and memory."""
+"""Largest number of features that a user's extractor may return for one image; with more, which would
+take too much time and memory, a UsageError is raised."""
 _MOTION_HISTORY_POSES = 10
-"""Number of newest poses that a user's motion model is given."""
+"""Largest number of poses that a user's motion model is given, the newest ones; older poses are dropped."""
 _MIN_PLACE_SIZE = 8
-"""Smallest length of the vector that a user's place recogniser returns: shorter ones do not tell places
-apart."""
+"""Smallest length of the vector that a user's place recogniser returns; a shorter one, which would
+not distinguish places, raises a UsageError."""
 _MAX_PLACE_SIZE = 4096
-"""Largest length of the vector that a user's place recogniser returns: bounds the memory of a keyframe."""
+"""Largest length of the vector that a user's place recogniser returns; a longer one, which would
+take too much memory for each keyframe, raises a UsageError."""
 _CLIP_RMS = 4.0
 """When a float descriptor becomes int8, its numbers are clipped at this many times their root mean square;
 the limit becomes 127."""
@@ -258,7 +260,7 @@ class MotionPlugin:
         self._recent.append((timestamp_s, T_world_camera))
 
     def clear(self) -> None:
-        """Forget all poses: tracking was lost, or the poses were moved to another world."""
+        """Forget all poses: tracking was lost, or the poses were moved to another world or adjusted."""
         self._recent.clear()
 
     def predict(self, timestamp_s: float) -> Array | None:
@@ -462,9 +464,10 @@ class Plugins:
             self.motion.add(timestamp_s, T_world_camera)
 
     def forget_poses(self) -> None:
-        """Drop the poses of the user's motion model, after tracking was lost or poses moved to another world.
+        """Drop the poses that the user's motion model would be given, because they fit later ones no longer.
 
-        The model predicts again after the next `add_pose`.
+        Tracking was lost, or the poses were moved to another world or adjusted.  The model predicts again
+        after the next `add_pose`.
         """
         if self.motion is not None:
             self.motion.clear()

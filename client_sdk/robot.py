@@ -59,7 +59,8 @@ if TYPE_CHECKING:
 __all__ = ["MAX_DEADLINE_S", "OnProgress", "Robot", "connect"]
 
 MAX_DEADLINE_S = 3600.0
-"""Longest deadline of a command in seconds; messages of the protocol carry no longer one."""
+"""Longest deadline of a command in seconds, since messages of the protocol carry no longer one; a call with a
+longer one raises a UsageError."""
 
 STORE_TIMEOUT_S = 5.0
 """Longest time for which one request of `Robot.store_object` waits for data, in seconds; the caller repeats

@@ -45,12 +45,21 @@ __all__ = [
     "unresolved",
 ]
 
-MIN_MEDIAN_DEPTH_M = 0.05  # median depth where the unit is stated: no depth camera measures nearer
-MAX_MEDIAN_DEPTH_M = 30.0  # median depth where the unit is stated: no depth camera measures farther
-MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # median depth where the unit is assumed: nearer is a wrong unit
-MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0  # median depth where the unit is assumed: rooms are smaller
-MIN_INTERVAL_S = 1e-4  # median time between images: no camera is faster than 10,000 Hz
-MAX_INTERVAL_S = 1e3  # median time between images: a longer one is a wrong unit of the time stamps
+MIN_MEDIAN_DEPTH_M = 0.05
+"""Where the unit of depth is stated, a source with a smaller median depth is refused: no camera measures
+nearer."""
+MAX_MEDIAN_DEPTH_M = 30.0
+"""Where the unit of depth is stated, a source with a larger median depth is refused: no camera measures
+farther."""
+MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2
+"""Where the unit of depth is assumed, a source with a smaller median depth is refused: its unit is another
+one."""
+MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0
+"""Where the unit of depth is assumed, a source with a larger median depth is refused: rooms are smaller."""
+MIN_INTERVAL_S = 1e-4
+"""A source whose median time between images is shorter is refused: no camera is faster than 10,000 Hz."""
+MAX_INTERVAL_S = 1e3
+"""A source whose median time between images is longer is refused: the unit of its time stamps is wrong."""
 _MIN_EPOCH_S = 1e9  # smallest median of time stamps that count as seconds since 1970: the year 2001
 _MAX_EPOCH_S = 1e10  # median from which on time stamps do not count as seconds since 1970: the year 2286
 _TIME_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
@@ -59,8 +68,8 @@ _USUAL_LOSS_SHARE = 0.1
 """Share of lost images, up to which a loss with `LossFacts.is_usual` is printed as a note and not as a
 finding: of two cameras that are not triggered together, some images always have no partner."""
 _MAX_VIDEO_END_DIFFERENCE = 0.5
-"""Difference between the times of the last images of two videos, in image intervals of the faster video: more
-means that one video lacks an image."""
+"""Largest difference between the times of the last images of the two videos of a stereo pair, in image
+intervals of the faster video; videos with a larger one are refused, because one of them lacks an image."""
 _MAX_NAMES_IN_SENTENCE = 12  # files that one sentence names at most; the others are counted
 
 
@@ -301,8 +310,8 @@ def time_unit_s(stamps: Array) -> tuple[str, float]:
     """Return the name and the length (s) of the most likely unit of time stamps ``(n,)`` that state no unit.
 
     Time stamps since 1970 show their unit by their size.  All others show it by their median interval, since
-    cameras are slower than 10,000 Hz and faster than 0.1 Hz: below 10 they are seconds, below 10,000
-    milliseconds, below 10 million microseconds, and else nanoseconds.
+    cameras are slower than 10,000 Hz and faster than 0.1 Hz: with a median interval below 10 the unit is the
+    second, below 10,000 the millisecond, below 10 million the microsecond, and else the nanosecond.
     Without two different time stamps, there is no interval, and the unit is the second.
     """
     unit = _unit_since_1970(stamps)

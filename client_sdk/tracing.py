@@ -23,7 +23,8 @@ __all__ = ["current_trace", "new_trace", "traced"]
 
 OPENTELEMETRY_MODULE = "opentelemetry.trace"
 MAX_ID_CHARACTERS = 64
-"""Longest trace id that is sent, in characters; a traceparent of W3C version 00 has 55."""
+"""Longest trace id that is sent, in characters; a longer one is cut.  A traceparent of W3C version 00 has
+55."""
 _trace_id: ContextVar[str] = ContextVar("rse_pf_trace", default="")
 
 

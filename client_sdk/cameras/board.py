@@ -22,8 +22,8 @@ _MIN_CORNERS = 3  # fewest inner corners of a board in a row or column: OpenCV n
 _MAX_CORNERS = (
     40  # most inner corners of a board in a row or column: more are too close to each other in an image
 )
-_MIN_SQUARE_M = 0.001  # smallest side of a square: users who state less have stated metres as millimetres
-_MAX_SQUARE_M = 1.0  # largest side of a square: a larger number is probably not in millimetres
+_MIN_SQUARE_M = 0.001  # a smaller side of a square is refused: the user has stated metres as millimetres
+_MAX_SQUARE_M = 1.0  # a larger side of a square is refused: the stated number is probably not in millimetres
 _MM_PER_POINT = 25.4 / 72.0  # millimetres in a point, the unit of PDF
 _MARGIN_MM = 10.0  # white margin around the board on a PDF page: printers do not print to the edge
 

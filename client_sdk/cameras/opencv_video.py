@@ -22,11 +22,14 @@ from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 __all__ = ["Video", "open_video"]
 
 _PROBED_FRAMES = 3  # the presentation times of this many frames show whether a file has such times
-_MAX_MISSES = 30  # a device that gave no image in this many successive reads counts as disconnected
-_MIN_RATE_HZ = 0.1  # smallest rate of a file that is used; a smaller one is a mistake of its container
-_MAX_RATE_HZ = 1000.0  # largest rate of a file that is used; a larger one is a mistake of its container
-_ASSUMED_RATE_HZ = 30.0  # rate of a file that states no rate that is used
-_TEXT_PROBE_BYTES = 64  # this many first bytes show whether a file is a text
+_MAX_MISSES = 30  # a device or stream that gave no image in this many successive reads is an error
+_MIN_RATE_HZ = 0.1
+"""Smallest rate of a file that is used; a smaller one is a mistake of its container, and 30 Hz are
+assumed."""
+_MAX_RATE_HZ = 1000.0
+"""Largest rate of a file that is used; a larger one is a mistake of its container, and 30 Hz are assumed."""
+_ASSUMED_RATE_HZ = 30.0  # rate of a file that states none, or one outside of these limits
+_TEXT_PROBE_BYTES = 64  # a file whose first bytes, this many, are printable is refused as a text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

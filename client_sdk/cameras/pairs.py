@@ -52,7 +52,7 @@ class PairVideos:
         their times differ by at most 0.4 image intervals of the video with the higher rate.  *log* counts
         images of videos without a partner, but not those that remain in the longer video at the end.
         """
-        # It is 0 for devices, whose images are paired without comparing times.
+        # The limit is 0 for devices, whose images are paired without comparing times.
         max_difference_s = _MAX_TIME_DIFFERENCE * min(self.left.period_s, self.right.period_s)
         left, right = next(self.left.images, None), next(self.right.images, None)
         while left is not None and right is not None:

@@ -18,7 +18,10 @@ RECENT_ROUND_TRIPS = 32
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """Percentiles over the run, from a uniform sample of at most 2,048 commands; None before the first."""
+    """Percentiles of a quantity since the robot was made, from a uniform sample of at most 2,048 values.
+
+    They are None while there is no value.
+    """
 
     p50: float | None
     p95: float | None
@@ -47,7 +50,7 @@ class Stats:
         duplicates: Second answers to a command that passed the session, which drops them: 0 unless the SDK is
             faulty.
         reconnects: How often a lost connection was replaced.
-        moves: How often a server asked the robot to change to another one, and it did.
+        moves: How often a server asked the robot to change to another server, and the robot did.
         region_changes: How often the robot changed to another of its addresses.
         bytes_out: Payload of all WebSocket messages that were sent.
         bytes_in: Payload of all WebSocket messages that were received.

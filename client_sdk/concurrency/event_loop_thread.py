@@ -21,7 +21,8 @@ __all__ = ["EventLoopThread", "wrong_process_error"]
 T = TypeVar("T")
 
 CLOSE_TIMEOUT_S = 5.0
-"""Longest time for the coroutine of *at_end*, which closes connections and a recording, in seconds."""
+"""Longest time for the coroutine of *at_end*, which closes connections and a recording, in seconds; it is
+cancelled after that."""
 THREAD_JOIN_S = 1.0
 """How long `EventLoopThread.close` waits after `CLOSE_TIMEOUT_S` for the loop, and then for its thread, in
 seconds: a function of the program may block them."""
@@ -102,7 +103,7 @@ class EventLoopThread:
                 return
             if not self._is_closing:
                 self._is_closing = True
-                with contextlib.suppress(RuntimeError):  # the loop has ended by itself
+                with contextlib.suppress(RuntimeError):  # the loop has ended already
                     self._loop.call_soon_threadsafe(self._stop.set)
         if self._thread is not threading.current_thread():
             self._ended.wait(CLOSE_TIMEOUT_S + THREAD_JOIN_S)

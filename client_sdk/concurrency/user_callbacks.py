@@ -149,10 +149,10 @@ class UserCallbacks:
         )
 
     def report(self, name: str, error: BaseException, *, has_traceback: bool = True) -> None:
-        """Count *error* of the user function *name*; log each type of error once a line that raised it."""
+        """Count *error* of the user function *name*; log each type of error once for each source line."""
         frames = traceback.extract_tb(error.__traceback__)
         source_line = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-        if self._is_new((name, type(error).__name__, source_line)):
+        if self._count((name, type(error).__name__, source_line)):
             if isinstance(error, RsePfError):
                 cause = error.message
             else:  # str(error) may raise
@@ -181,7 +181,7 @@ class UserCallbacks:
             loop.call_soon_threadsafe(loop.stop)
 
     def _report_slow(self, name: str, took_s: float) -> None:
-        if took_s > self._slow_s and self._is_new((name, "slow", "")):
+        if took_s > self._slow_s and self._count((name, "slow", "")):
             _log_error(
                 "%s took %.1f s, and session.ping_timeout_s is %.1f s; hint: do long work in a thread",
                 name,
@@ -189,7 +189,8 @@ class UserCallbacks:
                 self._slow_s,
             )
 
-    def _is_new(self, key: tuple[str, str, str]) -> bool:
+    def _count(self, key: tuple[str, str, str]) -> bool:
+        """Count a failed or slow call; return whether *key* is new, so that the call has to be logged."""
         with self._lock:
             self.errors += 1
             is_new = key not in self._reported
@@ -242,7 +243,7 @@ async def _await_token(function: Callable[[], Awaitable[str]]) -> Any:
                 hint="pass an async function, such as read_enrolment(FILE).token",
             )
         return await token
-    except (SystemExit, KeyboardInterrupt) as error:  # these exceptions would end the event loop
+    except (SystemExit, KeyboardInterrupt) as error:  # as they are, they would end the event loop
         if _is_interrupt(error):
             raise
         raise RuntimeError(f"{TOKEN_FUNCTION} raised {type(error).__name__}") from error

@@ -66,12 +66,18 @@ COLOUR_LENS = Lens(camera=COLOUR_CAMERA, distortion=_COLOUR_DISTORTION)
 DEPTH_LENS = Lens(camera=DEPTH_CAMERA, distortion=_DEPTH_DISTORTION)
 _MAX_DEPTH_M = 10.0  # largest depth that is used; a pixel with a larger one counts as without a reading
 _SIZE_PX = (COLOUR_CAMERA.width, COLOUR_CAMERA.height)  # width and height of all images of the data set
-_MAX_IMAGES = 10_000  # images, or names of scenes, in a labelled file: a multiple of the published one's
-_MAX_NAME_LENGTH = 256  # characters in the name of a scene; a longer text is the sign of a damaged file
-_MAX_CHUNK_VALUES = 1 << 26  # values in a chunk of an array of a labelled file: HDF5 inflates whole chunks
+_MAX_IMAGES = 10_000
+"""Most images, and most names of scenes, in a labelled file; a file with more is refused.  The published file
+has 1,449."""
+_MAX_NAME_LENGTH = 256
+"""Most characters in the name of a scene of a labelled file; a file with a longer name is refused as
+damaged."""
+_MAX_CHUNK_VALUES = 1 << 26
+"""Most values in a chunk of an array of a labelled file; a file with a larger chunk is refused, because HDF5
+inflates whole chunks in memory."""
 _MAT_HINT = "name nyu_depth_v2_labeled.mat as it was published"
 _H5PY_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
-"""Errors that h5py raises for a damaged file."""
+"""Errors that h5py raises for a damaged file; each becomes a UsageError."""
 _SHAPES = {"images": (3, *_SIZE_PX), "depths": _SIZE_PX, "rawDepths": _SIZE_PX}
 """Shape of one image in each array of the labelled file: (channels,) columns, rows."""
 _RAW_FILE_NAME = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")

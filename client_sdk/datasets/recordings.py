@@ -46,7 +46,7 @@ from rse_pf.geometry import Camera, Lens
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 
-_MAX_LIST_BYTES = 64 << 20  # largest rgb.txt or depth.txt that is read: enough for a million images
+_MAX_LIST_BYTES = 64 << 20  # a longer list of images is refused; this is enough for a million images
 _MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest time between the colour and the depth image of a frame of a TUM folder, as in TUM's
 ``associate.py``."""

@@ -207,7 +207,8 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         notes=notes,
         doubts=doubts,
     )
-    # The body of `read_kitti_rig` is the camera of P0, because KITTI states no pose of a camera in a vehicle.
+    # KITTI states no pose of a camera in a vehicle, so that the pose of the camera in its body is not known;
+    # the body of `read_kitti_rig` is the camera of P0 instead.
     return replace(dataset, T_body_camera=None)
 
 

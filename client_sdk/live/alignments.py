@@ -234,7 +234,7 @@ class Alignments:
             return None
         segment = update.segment - self._first_segment
         if segment < 0:
-            return None  # a segment of an earlier run of this robot
+            return None  # ignore a segment of an earlier run of this robot
         if not update.aligned:
             # A map that has too few loop closures to align the segment does not contradict a relocalisation;
             # a map in which the segment fits several places does.
@@ -346,8 +346,10 @@ def _parse_scale(metres_per_unit: float | None) -> float:
 def _parse_covariance(numbers: Any) -> Array | None:
     """Return the 21 numbers of an upper triangle, row by row, as a symmetric ``(6, 6)`` covariance.
 
+    The result is None for None.
+
     Raises:
-        BadMessage: There are not 21 finite numbers.
+        BadMessage: *numbers* are neither None nor 21 finite numbers.
     """
     if numbers is None:
         return None

@@ -45,7 +45,8 @@ StoreObject = Callable[[bytes], Awaitable[str]]
 """Function that stores bytes as an object of the robot and returns their sha256; it may raise RsePfError."""
 
 _BURST_S = 2.0
-"""A byte budget holds at most this many seconds of its rate, for the next keyframe after a pause."""
+"""While no keyframe is made, a byte budget grows to at most this many seconds of its rate; the next keyframes
+may spend all of it."""
 _BYTES_PER_POINT = 4.5  # mean size of an encoded point after zlib, to turn a byte budget into a point count
 _MIN_POINTS = 400  # points of a keyframe (about 2 kB) that are sent even if the byte budget is spent
 _JPEG_QUALITY = 85  # JPEG quality, 0 to 100, of the images of keyframes

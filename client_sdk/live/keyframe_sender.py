@@ -45,7 +45,9 @@ __all__ = [
     "make_request",
 ]
 
-_MAX_POSE_WAIT_S = 1.0  # longest wait of a keyframe for open pose queries, which could else delay it for ever
+_MAX_POSE_WAIT_S = 1.0
+"""Longest time for which a keyframe waits until no pose query is open, in seconds; then it is sent in any
+case, because a robot that always has an open query would never send one."""
 _FIRST_PAUSE_S = 0.1  # pause after the first failed attempt in seconds; it doubles with each failure in a row
 _MAX_PAUSE_S = 1.0
 """The pause after a failed attempt does not double beyond this, in seconds, so that a server that returns

@@ -30,7 +30,8 @@ MAX_PAUSE_RATIO = 1.0 / 3.0
 """Once attempts have failed for more than three times ``reconnect_max_s``, a pause is at most this share of
 the time for which they have failed: after an outage of a minute a robot is back within 20 seconds."""
 UNANSWERED_MIN_S = 1.0
-"""Shortest time between the starts of two attempts that nobody answers: such attempts load no server."""
+"""Shortest time between the starts of two attempts that nobody answers.  It never grows, because such
+attempts load no server."""
 UNANSWERED_MAX_S = 1.25
 """Longest time between the starts of two attempts that nobody answers; it differs from the shortest one so
 that robots of one site do not dial at the same moment."""
@@ -41,8 +42,8 @@ MOVE_RESERVE = 0.5
 """While a robot is connected and moves to another server, this share of its token bucket is kept for the case
 that it loses its connection."""
 RETRY_AFTER_SPREAD = 1.25
-"""A robot waits up to this multiple of the time that a server asked for, so that robots that got the same
-number do not come back at the same moment."""
+"""The time that a server asked for (``Retry-After``) is multiplied by a random number from 1 to this one, so
+that robots that got the same time do not come back at the same moment."""
 MAX_PAUSE_DOUBLINGS = 16
 """The limit of the exponential pause stops doubling after this many attempts, so that it stays finite."""
 
@@ -75,7 +76,8 @@ class Backoff:
         self._failing_since_s = None
 
     def count_attempt(self, now_s: float) -> None:
-        """Take one from the token bucket for an attempt that was answered at *now_s*, robot's clock."""
+        """Take one token from the bucket for an attempt that was answered at *now_s*, seconds of the robot's
+        clock."""
         self._bucket.spend(1.0, now_s)
 
     def pause_s(

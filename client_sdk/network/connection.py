@@ -105,14 +105,16 @@ FIRST_CONNECT_ATTEMPTS = 4
 MIN_TIMER_PAUSE_S = 0.001
 """Shortest pause of the timer task, so that deadlines that are due at once do not make it spin."""
 OTHER_REGIONS_MAX_WAIT_S = 0.7
-"""Longest wait for the other regions of a first connect once one of them can be used, in seconds."""
+"""Longest wait for the other regions of a first connect once one of them can be used, in seconds; attempts
+that take longer go on in the background."""
 DUPLICATE_REGION_S = 5.0
 """A platform keeps one connection of a robot, and closes the older one as replaced when a newer one opens.
 If it does so within this many seconds after the robot opened a connection in another region, both addresses
 lead to the same platform."""
 LATE_WELCOME_S = 60.0
 """A stalled server may accept an attempt to connect up to this many seconds after the robot gave it up.  The
-platform then closes the robot's newer connection as replaced, and no other program is the cause."""
+platform then closes the robot's newer connection as replaced; within this time the robot reconnects after
+such a close, and does not report that another program uses its token."""
 TOKEN_CLOCK_STEP_S = 1.0
 """After a revocation the robot waits this many seconds before it signs a new token: a token states its time
 in whole seconds, which must be later than the revocation."""
@@ -290,8 +292,8 @@ class Connection:
     async def _join_nearest_region(self) -> list[DialError]:
         """Dial all regions at once, and return the failures once the nearest usable region is known.
 
-        Attempts that still run are left to `Region.first_join`.  Without a failure, the list holds the error
-        for the case that no socket can be used any more, so that it is never empty.
+        Attempts that still run are left to `Region.first_join`.  If no attempt has failed, the list holds an
+        error for a caller that then finds no usable socket, because all were closed again.
         """
         # 1. Dial every region, and wait until the first one can be used or all have failed.
         began_s = self._clock()
@@ -332,7 +334,7 @@ class Connection:
         return None
 
     def _hold_socket(self, socket: RegionSocket) -> None:
-        """Make a welcomed *socket* the one of its region, in the state STANDBY."""
+        """Make a welcomed *socket* the one of its region, in the state STANDBY, unless it has ended."""
         region = socket.region
         if not socket.has_ended.is_set():
             region.socket = socket
@@ -349,7 +351,8 @@ class Connection:
             return
         socket.measured_exchange = exchange
         socket.has_round_trip.set()
-        # The time that a pong states for the server is not subtracted: a server could state all of it.
+        # The time between ping and pong that the server states as its own is not subtracted: a server that
+        # states the whole time would seem to be the nearest one.
         self._choice.add_round_trip(socket.region.number, exchange.returned_s - exchange.sent_s)
         usable, current = self._usable_sockets(), self._current_region()
         if len(self._regions) > 1 and current.number in usable:
@@ -453,9 +456,7 @@ class Connection:
             except DialError as error:
                 failure = error
             else:
-                if (
-                    self._session.current is not old.state
-                ):  # the old socket was lost while this one was dialled
+                if self._session.current is not old.state:  # *old* was lost during the attempt
                     self._hold_socket(fresh)
                     self._adopt_if_disconnected(region)
                     return
@@ -588,7 +589,7 @@ class Connection:
                     self._tap.observe_message(socket.tap_number, "up", data)
                     await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
-            return  # the reading task handles the end, after the messages that still arrived
+            return  # the reading task discards the socket, after it has read the messages that still arrive
 
     def _handle_events(self, socket: RegionSocket | None, events: list[Event]) -> None:
         for event in events:

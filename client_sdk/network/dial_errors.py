@@ -64,7 +64,8 @@ SHORT_REFUSAL_S = 2.0
 """If the servers will accept this robot within this many seconds, their refusal is not reported: commands and
 a first connect wait until then."""
 REFUSALS_OF_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
-"""Causes that a refusal names and that a token signed now would meet as well, so that none is signed."""
+"""Causes in a refusal because of which a token signed now would be refused as well, so that the robot does
+not repeat the attempt at once with a second token."""
 
 
 class DialError(Exception):

@@ -51,8 +51,8 @@ TCP_TIMEOUT_S = 1.0
 repeats an unanswered attempt only after 1, 3 and 7 s; a new attempt reaches a server sooner when the network
 is back."""
 MAX_FIRST_BYTES = 4096
-"""How many first bytes of the peer are kept, to explain an answer that is not HTTP/1.1: head and page
-title."""
+"""Once this many bytes of the peer are held, no further ones are kept.  They explain an answer that is not
+HTTP/1.1, and its head and page title are in the first bytes."""
 
 
 def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dict[str, Any]:

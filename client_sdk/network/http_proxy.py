@@ -73,7 +73,10 @@ def open_tunnel(proxy: Proxy, parts: SplitResult, timeout_s: float) -> socket.so
 
 
 def _tunnel_error(proxy: Proxy, parts: SplitResult, error: Exception) -> DialError:
-    """Return the error of a tunnel that was not opened; an answer of 4xx to CONNECT counts as lasting."""
+    """Return the error of a tunnel that was not opened.
+
+    After an answer 4xx to CONNECT, the URL or the proxy has to change first (`DialError.is_wrong_address`).
+    """
     names = f"the proxy {proxy.shown_url}, which {proxy.variable} names,"
     # http.client states the answer of the proxy only in the text of its error.
     answer = shorten(str(error).partition("Tunnel connection failed: ")[2])

@@ -17,11 +17,13 @@ from typing import Any
 __all__ = ["TcpDialler"]
 
 LOOKUP_WAIT_S = 0.25
-"""An attempt waits this long for a name server if addresses of the host are known from an earlier lookup."""
+"""If addresses of the host are known from an earlier lookup, an attempt waits this many seconds for the name
+server, and then uses the known ones."""
 NEXT_ADDRESS_S = 0.25
-"""While no address of a host has answered, the next one is tried after this time (RFC 8305, 5)."""
+"""While no address of a host has answered, the next one is tried after this many seconds (RFC 8305, 5)."""
 MAX_ADDRESSES = 4
-"""An attempt tries at most this many addresses of a host, so that a long list cannot fill the time limit."""
+"""An attempt tries the first of the addresses of a host, at most this many, and ignores all others: a long
+list would fill the time limit."""
 
 _AddressInfo = tuple[Any, ...]
 """What `socket.getaddrinfo` returns for one address: family, type, protocol, canonical name, socket
@@ -49,11 +51,11 @@ class TcpDialler:
 
     async def _find_addresses(self, host: str, port: int, within_s: float) -> list[_AddressInfo]:
         key = (host, port)
-        # 1. Return an IP address as it is, without a name server.
+        # 1. Return an IP address as it is, without a name server; a host name fails here, and is looked up.
         with contextlib.suppress(socket.gaierror):
             numeric = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
             return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)
-        # 2. Look the name up; a lookup that still runs from an earlier attempt is used.
+        # 2. Look the name up; if a lookup of an earlier attempt still runs, wait for it instead.
         lookup = self._lookups.get(key)
         if lookup is None:
             loop = asyncio.get_running_loop()
@@ -62,13 +64,13 @@ class TcpDialler:
             lookup.add_done_callback(lambda ended: self._keep_addresses(key, ended))
         known = self._known.get(key)
         done, _ = await asyncio.wait({lookup}, timeout=within_s if known is None else LOOKUP_WAIT_S)
-        # 3. Prefer fresh addresses, then the last known ones.
+        # 3. Return the addresses of this lookup, or else the last known ones; raise if there are neither.
         if done and lookup.exception() is None:
             return lookup.result()
         if known is not None:
             return known
         if done:
-            return lookup.result()  # raises the error of the name server
+            return lookup.result()  # raises the error of the lookup
         raise OSError(errno.ETIMEDOUT, f"no name server answers for {host}")
 
     def _keep_addresses(self, key: tuple[str, int], lookup: asyncio.Future[list[_AddressInfo]]) -> None:
@@ -78,9 +80,14 @@ class TcpDialler:
 
 
 async def _connect_first(addresses: list[_AddressInfo], until_s: float) -> socket.socket:
-    """Return the first connection to one of *addresses*.
+    """Return the first connection to one of *addresses* that succeeds.
 
-    An attempt begins `NEXT_ADDRESS_S` after the one before, or when that one fails; earlier ones go on.
+    The attempt to the next address begins `NEXT_ADDRESS_S` after the one before, or when that one fails;
+    earlier attempts go on.  All end at *until_s* of the event loop's clock, or after the first success.
+
+    Raises:
+        OSError: No attempt succeeded: the error of a refused connection if there was one, else that of the
+            first attempt that failed, else ``ETIMEDOUT``.
     """
     loop = asyncio.get_running_loop()
     untried, running = deque(addresses), set[asyncio.Task[socket.socket]]()
@@ -98,7 +105,7 @@ async def _connect_first(addresses: list[_AddressInfo], until_s: float) -> socke
                 running.discard(task)
                 try:
                     return task.result()
-                except OSError as error:  # a refusal tells more than a time-out of another address
+                except OSError as error:  # prefer a refusal, which says more than a time-out
                     failure = error if failure is None or error.errno == errno.ECONNREFUSED else failure
     finally:
         for task in running:

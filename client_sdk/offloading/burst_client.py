@@ -40,9 +40,11 @@ TOKEN_REUSE_S = 60.0
 """How long the client of the burst function reuses a signed token, in seconds: signing costs time, and tokens
 are valid for minutes."""
 IDLE_TIMEOUT_S = 20.0
-"""How long an unused HTTP connection to the burst function is kept for the next command, in seconds."""
+"""How long an unused HTTP connection to the burst function may be used for another command, in seconds; an
+older one is closed instead of used."""
 MAX_IDLE_CONNECTIONS = 4
-"""Most unused HTTP connections to the host of the burst function that are kept."""
+"""Most unused HTTP connections to the host of the burst function that are kept for later commands; a further
+one is closed after its command."""
 MAX_RETRY_AFTER_S = 86400.0
 """Longest time for which an answer of the burst function can make the robot send it no command, in seconds; a
 longer ``Retry-After`` is cut to this."""
@@ -243,7 +245,8 @@ class BurstClient:
         while idle:
             last = idle.pop()
             if self._clock() - last.since_s < IDLE_TIMEOUT_S:
-                with contextlib.suppress(ConnectionError):  # the peer has closed this connection meanwhile
+                # If the peer has closed this connection meanwhile, try the next one.
+                with contextlib.suppress(ConnectionError):
                     return self._exchange(last.connection, target, body, headers, idle)
             last.connection.close()
         connection = open_connection(parts, EXCHANGE_TIMEOUT_S, self._tls_context(host))

@@ -109,7 +109,9 @@ class BurstPolicy:
         """
         self.in_flight -= 1
         is_open = self._failures >= BREAKER_FAILURES and now_s < self._open_until_s
-        self._failures += not is_open  # commands in flight together fail for one cause: count it once
+        # Commands that were in flight when the circuit breaker opened fail for the same cause, and do not
+        # count.
+        self._failures += not is_open
         open_s = 0.0
         if self._failures >= BREAKER_FAILURES and not is_open:
             doublings = min(self._failures - BREAKER_FAILURES, MAX_DOUBLINGS)

@@ -78,7 +78,7 @@ class CommandRouter:
         Args:
             session: Encodes commands for the servers, and holds those without an answer.
             flush: Sends the messages that *session* has encoded.
-            counter: Is told the round trips to servers, and predicts the next one.
+            counter: Gets the round trips to servers, and predicts the next one.
             clock: Monotonic seconds.
             policy: Plans the commands; None means `CloudFirst` with its defaults.
             local: Services of the robot itself; None if the robot never computes commands.

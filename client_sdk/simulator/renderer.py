@@ -23,7 +23,7 @@ _Image = npt.NDArray[np.float32]
 _NEAR_M = 0.05  # depth of the near plane: nearer parts of faces are not drawn
 _MIP_BIAS = 0.7
 """Added to a mip level before truncation; 0.5 would round, 0.7 prefers a coarser level: less aliasing."""
-_MIN_MIP_COSINE = 0.05  # smallest cosine of incidence with which a mip level is chosen, to limit the blur
+_MIN_MIP_COSINE = 0.05  # a smaller cosine of incidence counts as this in the choice of a mip level: less blur
 _MAX_MIP_LEVELS = 12  # levels of a texture of 2048x2048 texels, the largest that is supported
 
 # Brightness of the surfaces in a room, by which the colour of a texture is multiplied

@@ -341,7 +341,8 @@ class DataClient:
                     "PATCH", path, _Upload, part, {"Upload-Offset": str(offset)}, digest=digest
                 )
             except (Conflict, NotFound):
-                # The answer to an earlier part was lost, or another process uploads the same object.
+                # The answer to an earlier part was lost, or another process uploads the same object: ask how
+                # many bytes the data service has.
                 state = self._reply("PUT", path, _Upload, request, digest=digest)
             offset = state.offset
             self._report(progress, offset, size)
@@ -388,7 +389,8 @@ class DataClient:
                 response = _request_bucket("GET", route.url, headers, None, options.timeout_s)
                 if response is not None:
                     return response
-            # The presigned URL is not safe or has expired, or the bucket cannot be reached.
+            # The presigned URL is not safe or has expired, or the bucket cannot be reached: ask for another
+            # one.
             route.url, route.attempts_left = "", route.attempts_left - 1
             options.sleep(options.first_pause_s)
         return self._request("GET", path, bytes, None, headers, expected=(416,))
@@ -410,7 +412,7 @@ class DataClient:
             elif status == 206:
                 received += piece
                 _append(partial, piece)
-            elif size != len(received):  # the partial file is longer than the object
+            elif size != len(received):  # the hidden file is longer than the object: begin again
                 received.clear()
                 _remove(partial)
             self._report(progress, len(received), size)
