@@ -49,8 +49,8 @@ class LensModel:
         part_of_opencv: Maps the module ``cv2`` to the module with the functions of this model.
         distort_points: ``(cv2, rays (n, 2), K, coefficients)`` to ``(n, 1, 2)``: the distorted pixels of
             points ``(x, y, 1)`` of the camera frame.
-        rectification_margin: Name of the option of ``stereoRectify`` that is 0 if the rectified images hold
-            only pixels that their camera sees.
+        rectification_margin: Name of the option of OpenCV's ``stereoRectify`` that is set to 0, so that the
+            rectified images hold only pixels that their camera sees.
     """
 
     name: str
@@ -138,7 +138,7 @@ class Lens:
 
     @property
     def coefficients(self) -> Array:
-        """The distortion coefficients ``(m,)`` in OpenCV's order; four zeros where there is no distortion."""
+        """The distortion coefficients ``(m,)`` in OpenCV's order; four zeros if the lens states none."""
         return np.array(self.distortion or (0.0, 0.0, 0.0, 0.0))
 
     def undistort_pixels(self, pixels: Array) -> Array:
@@ -312,4 +312,4 @@ _MODELS = (
 )
 
 LENS_MODELS: Mapping[str, LensModel] = {model.name: model for model in _MODELS}
-"""All lens models by their names: the one place where a model is defined."""
+"""All lens models, by their attribute ``name`` (not by their aliases)."""

@@ -107,7 +107,8 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
     """
     if T.shape != (4, 4):
         return None
-    # Plain floats decide on a valid pose twenty times faster than numpy does; `rigid_many` has the same rule.
+    # Return a pose that needs no correction at once: plain floats check it twenty times faster than numpy
+    # does.  `rigid_many` applies the same rule to all other matrices.
     (a, b, c, x), (d, e, f, y), (g, h, i, z), (s, t, u, v) = T.tolist()
     deviation = max(
         abs(a * a + d * d + g * g - 1.0),
@@ -127,7 +128,10 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
 
 
 def orthonormalise(T: Array) -> Array:
-    """Return a copy of a ``(4, 4)`` pose with the nearest rotation, from which a product of poses drifts."""
+    """Return a copy of a ``(4, 4)`` pose whose upper left block is replaced by the nearest rotation.
+
+    A pose that is the product of many poses needs this, because rounding errors add up in its rotation.
+    """
     U, _, Vt = np.linalg.svd(T[:3, :3])
     orthonormal: Array = T.copy()
     orthonormal[:3, :3] = U @ Vt
@@ -213,7 +217,8 @@ def log_se3(T: Array) -> Array:
     cosine = 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
     angle = np.arctan2(sine, cosine)
     phi = v * np.where(sine < 1e-5, 1.0, angle / np.maximum(sine, 1e-12))[:, None]
-    # The antisymmetric part of R vanishes at half a turn; the quaternion does not.
+    # Near half a turn, where the antisymmetric part of R vanishes, compute the angle and the rotation vector
+    # from the quaternion instead.
     for row in np.flatnonzero(cosine < NEAR_HALF_TURN_COSINE).tolist():
         q = to_quaternion(R[row])
         half_sine = float(np.linalg.norm(q[:3]))

@@ -38,10 +38,11 @@ _CHARGE = re.compile(
 size in bytes."""
 _MAX_RECORD_BYTES = 1 << 20
 """Largest size in bytes of the record of one version in a backup file: 1 MiB, though a record with many
-robots has some KiB only."""
+robots has some KiB only.  A file with a larger record is refused as malformed."""
 _MAX_CONTENT_BYTES = 256 << 20
-"""Largest size in bytes of the member of a backup file that lists heads and charges: 256 MiB, enough for
-10,000 maps with all their versions."""
+"""Largest size in bytes of the member `_CONTENT_FILE` of a backup file: 256 MiB, enough for the heads of
+10,000 maps and 900,000 charges of versions, each of at most 277 bytes.  A file with a larger member is
+refused as malformed."""
 _CHUNK_BYTES = 1 << 20  # bytes of an archive's member that are read at once: 1 MiB
 
 
@@ -100,19 +101,20 @@ def write_backup(
 
 def _write_map(archive: tarfile.TarFile, maps: MapRegistry, name: str) -> tuple[str, set[str]]:
     """Write a map; return the id of its head, and the ids of all versions that were written."""
-    # 1. Write the version that is the head now, so that the backup has it even if it is removed meanwhile.
+    # 1. Write the version that is the head now before all others, so that the backup has it even if another
+    #    process removes it while the others are written.
     head, data = _read_head(maps, name)
     _add_member(archive, f"{name}/blobs/{head.digest}", data)
     _add_record(archive, name, head)
     digests, ids = {head.digest}, {head.id}
-    # 2. Write the other versions, and equal bytes only once.
+    # 2. Write the other versions; bytes that several versions share are written only once.
     for record in _list_versions(maps, name):
         if record.id == head.id:
             continue
         if record.digest not in digests:
             try:
                 data = maps.data(name, record.id)
-            except NotFound:  # Another process has removed this version meanwhile.
+            except NotFound:  # Leave out a version that another process has removed meanwhile.
                 continue
             _add_member(archive, f"{name}/blobs/{record.digest}", data)
         digests.add(record.digest)
@@ -193,7 +195,7 @@ def check_backup(file: BinaryIO) -> CheckedBackup:
 
 def _read_backup(file: BinaryIO) -> CheckedBackup:
     """Return the backup of *file*; raises ValueError and errors of tarfile and msgspec if it is malformed."""
-    # The result keeps the archive open, which is read until the caller closes the file.
+    # Leave the archive open: `CheckedBackup.data` reads maps from it until the caller closes *file*.
     archive = tarfile.open(fileobj=file, mode="r:")  # noqa: SIM115
     records: dict[str, list[MapRecord]] = {}
     blobs: dict[tuple[str, str], tarfile.TarInfo] = {}
@@ -285,7 +287,7 @@ def restore_backup(
             f"maps exist and have another head: {', '.join(different)}"[:300],
             hint="--overwrite sets their heads to those of the backup; their other versions stay",
         )
-    # 2. Check the quota.
+    # 2. Check by *check_room* whether the quota allows all versions that the store lacks.
     missing = {name: maps.missing_versions(name, records) for name, records in backup.records.items()}
     added = [record for records in missing.values() for record in records]
     if added:

@@ -60,28 +60,33 @@ UP = (0.0, 0.0, 1.0)
 axis points up."""
 
 _MAGIC = b"RSEMAP1\n"  # the first bytes of a map file, with the version of the format
-_MAX_BYTES = 1 << 30  # largest size of a decompressed map file: 1 GiB
+# Largest size of a decompressed map file (1 GiB) if the caller of `decode_map` states no other; a larger map
+# is refused.
+_MAX_BYTES = 1 << 30
 _MAX_COMPRESSION_RATIO = 50.0
 """Largest accepted ratio of the decompressed to the compressed size of a map file: features and point clouds
-compress to half their size only, so that a file with a larger ratio is hostile."""
+compress to half their size only, so that a file with a larger ratio is hostile, and is refused."""
 _UNCHECKED_BYTES = 1 << 20
 """Decompressed size in bytes up to which a map file may have any compression ratio: 1 MiB of memory harms
 nobody."""
 _MAX_ID = 2**63 - 1  # the largest id of a keyframe: an int64
 _MAX_NAME_LENGTH = 64  # largest number of characters of the name of a keyframe's robot
 _MAX_COORDINATE_M = 1e9
-"""Largest coordinate in metres of a point in a map; larger numbers overflow in later computations."""
+"""Largest absolute coordinate in metres of a point in a map, beyond any map; far larger ones would overflow
+float32 when they are squared."""
 _MAX_TIME_S = 1e12
-"""Largest time of a keyframe in seconds from 1970; larger numbers overflow in later computations."""
-_MAX_PIXEL = 1e5  # largest coordinate of a feature in pixels: no camera has wider images
+"""Largest absolute time of a keyframe in Unix seconds: far beyond any clock, and float64 still resolves
+0.2 ms."""
+_MAX_PIXEL = 1e5  # largest absolute coordinate of a feature in pixels: no camera has wider images
 _MAX_INFORMATION = 1e18
-"""Largest number in the information matrix of an edge: a standard deviation of 1 nm or 1 nrad."""
+"""Largest absolute number in the information matrix of an edge: a standard deviation of 1 nm or 1 nrad."""
 _ITEM_VALUES = {"keyframes": 100, "edges": 40}
-"""Largest number of MessagePack values (keys, numbers, strings and byte strings) of one keyframe and of one
-edge: more than they have in this release, so that a later release can add fields."""
+"""Largest average number of MessagePack values (keys, numbers, strings and byte strings) of the keyframes of
+a map file, and of its edges: more than they have in this release, so that a later release can add fields.  A
+file with more is refused."""
 _OTHER_FIELD_VALUES = 1000
-"""Largest number of MessagePack values of a field of the map file that this release does not know, and
-ignores."""
+"""Largest number of MessagePack values of each field of a map file other than keyframes, edges and
+provenance; also of a field of a later release, which is ignored.  A file with more is refused."""
 _UNSAFE_IN_FILE_NAMES = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -358,16 +363,16 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | Non
         LimitExceeded: The map holds more than *limits* allow.
     """
     limits = limits or MapLimits()
-    # 1. Decompress, with a limit of the size.
+    # 1. Decompress, and refuse bytes that decompress to more than *max_bytes*.
     content = _decompress(data, max_bytes)
     try:
-        # 2. Count keyframes, edges and features on the bytes.
+        # 2. Check the numbers of keyframes, edges and features before arrays are made from the bytes.
         _check_fields(content, limits)
         encoded = msgspec.msgpack.decode(memoryview(content).toreadonly(), type=_EncodedMap)
         features = encoded.features
         kind = ORB if features is None else DescriptorKind(features.name, features.dtype, features.size)
         _check_feature_counts(encoded.keyframes, limits, kind.size)
-        # 3. Make the values, which check themselves.
+        # 3. Make keyframes, edges and the map, each of which checks its own values.
         return MapVersion(
             keyframes=tuple(_decode_keyframe(keyframe, kind) for keyframe in encoded.keyframes),
             edges=tuple(

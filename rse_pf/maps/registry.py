@@ -54,8 +54,8 @@ _MAX_VERSIONS = 10_000
 _CHUNK_BYTES = 1 << 20
 """Number of bytes of an object that are in memory at once while a map is committed from it: 1 MiB."""
 _REMOVED_AT_ONCE = 50
-"""Number of versions that are marked and removed together: so few that a slow store removes them before
-`MAX_REMOVAL_S`, at which a removal stops."""
+"""Number of encoded maps that are marked and removed together, each with all its versions: so few that a slow
+store removes them before `MAX_REMOVAL_S`, at which a removal stops."""
 _MIN_MOTION_M = 1e-3
 """Translation of a keyframe between two versions, in metres, above which the keyframe counts as moved: more
 than the rounding of poses in messages."""
@@ -190,7 +190,8 @@ class MapRegistry:
         Raises:
             BadRequest: *data* is not a map, or *name* is not a valid name.
             Conflict: The head is not *parent*: read the head, merge, and commit again.
-            LimitExceeded: The tenant has too many maps, or the map too many versions.
+            LimitExceeded: *data* has too many keyframes, features or edges, the tenant too many maps, or the
+                map too many versions.
             Busy: The same bytes are being removed.
             StoreError: The store failed; the head did not change.
         """
@@ -281,7 +282,8 @@ class MapRegistry:
             points=summary.points,
             robots=summary.robots,
         )
-        # 2. Charge and write the map and the record, then move the head.
+        # 2. Unless a process removes the same bytes, charge and write the map and the record, then move the
+        #    head.
         self._marks(name).check(digest)
         is_new = not self._exists(f"{base}blobs/{digest}")
         with charged(record, content.size if is_new else 0):
@@ -299,7 +301,8 @@ class MapRegistry:
             name: Name of the map.
             record: The record.
             write: Writes the bytes of the version to the object with the given name.
-            is_new: Whether the bytes are not in the store yet.
+            is_new: Whether to write the bytes before the record, because the store lacks them or has them
+                damaged.  Otherwise they are written only if a removal has deleted them meanwhile.
 
         Raises:
             Busy: Another process removes these bytes; the record is removed again.
@@ -375,7 +378,7 @@ class MapRegistry:
             self._on_change("map.restore", name, self.record(name, head))
 
     def _check_counts(self, base: str, *, is_new: bool) -> None:
-        """Raise LimitExceeded if the map has too many versions, or is new and the tenant has too many."""
+        """Raise LimitExceeded if a map has too many versions, or is new and the tenant has too many maps."""
         versions = self._store.usage(f"{base}versions/").objects
         if versions >= _MAX_VERSIONS:
             raise LimitExceeded(
@@ -402,7 +405,8 @@ class MapRegistry:
             try:
                 return self.record(name, head)
             except NotFound:
-                # The head may have moved after it was read, and the old version may have been removed.
+                # Read the head again, since another process may have moved it and removed the old version;
+                # if the head is the same, its version is missing.
                 missing, head = head, self._head(name)
                 if head == missing:
                     raise
@@ -432,14 +436,18 @@ class MapRegistry:
     def versions(self, name: str) -> list[MapRecord]:
         """Return the records of all versions, oldest first, whether or not they are ancestors of the head.
 
+        A version that another process removes meanwhile is left out.
+
         Raises:
             NotFound: There is no map *name*.
+            StoreError: A record is damaged.
         """
         prefix = f"{self._base(name)}versions/"
         records = []
         for info in self._store.list(prefix):
             self._check()
-            with contextlib.suppress(NotFound):  # Another process has removed this version meanwhile.
+            # Leave out a version whose record another process has removed since the store listed it.
+            with contextlib.suppress(NotFound):
                 records.append(self.record(name, info.name.removeprefix(prefix)))
         if not records:
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
@@ -584,7 +592,7 @@ class MapRegistry:
             digests: Digests of versions by their ids; those of versions that are read are added.
 
         Raises:
-            Busy: A minute is over; the rest was not removed.
+            Busy: `MAX_REMOVAL_S` after the begin of the batch, the rest of it was not removed.
         """
         base, marks = self._base(name), self._marks(name)
         began_s = self._wall_clock()
@@ -607,7 +615,8 @@ class MapRegistry:
                         f"the store removed fewer than {len(batch)} versions in {MAX_REMOVAL_S:g} s",
                         hint="call again to remove the rest: rse-pf map prune",
                     )
-                # If an error follows, this mark stays, so that the next call finishes the removal.
+                # Do not clear this mark at the end if an error follows: by it the next removal finds, and
+                # deletes, the bytes that this removal left.
                 mark = set_marks.pop(digest)
                 remove_charges(self._store, self._tenant, name, {record.id for record in records})
                 for record in records:
@@ -630,7 +639,8 @@ class MapRegistry:
         for version in ids | ({head} if head is not None else set()):
             self._check()
             if version not in digests:
-                with contextlib.suppress(NotFound):  # Another process has just removed this version.
+                # Leave out a version that another process has just removed: it uses no bytes any more.
+                with contextlib.suppress(NotFound):
                     digests[version] = self.record(name, version).digest
         return {digest for version, digest in digests.items() if version in ids or version == head}
 

@@ -6,8 +6,9 @@ rollback first writes its record or mark, and then looks for marks of removals. 
 processes sees the other, as in Dekker's algorithm, and no head refers to removed bytes.
 
 A mark is the empty object ``maps/TENANT/NAME/blobs/DIGEST.KIND-SECONDS-TOKEN``.  It is an empty file in an
-existing folder, which can be written to a full disk.  A removal stops after `MAX_REMOVAL_S`, long before its
-marks count as abandoned after `ABANDONED_S`; the next removal finishes the work of a process that crashed.
+existing folder, which can be written to a full disk.  A removal that is slow stops `MAX_REMOVAL_S` after it
+has set its marks, long before they count as abandoned after `ABANDONED_S`; the next removal finishes the work
+of a process that crashed.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ __all__ = [
 HELD = "held"  # kind of a mark by which a rollback protects the bytes of a version from removal
 REMOVING = "removing"  # kind of a mark of a process that removes the bytes of a version
 MAX_REMOVAL_S = 60.0
-"""Seconds after which a process that removes versions deletes nothing more, long before others ignore its
-marks."""
+"""Seconds after the begin of a batch of removals at which the process deletes no more versions, and stops
+with an error: long before other processes ignore its marks (`ABANDONED_S`)."""
 ABANDONED_S = 600.0
-"""Age in seconds above which a mark in the store is ignored: a process removes its marks after at most
-`MAX_REMOVAL_S`, so that the process of an older mark has crashed."""
+"""Age in seconds above which a mark in the store is ignored: a process clears its marks soon after
+`MAX_REMOVAL_S` at the latest, so that the process of an older mark has crashed."""
 _RETRY_MS = 1000.0
 """Milliseconds after which a client should repeat a commit whose bytes are just being removed."""
 _MARK = re.compile(rf"(?P<digest>[0-9a-f]{{64}})\.(?P<kind>{HELD}|{REMOVING})-(?P<set_s>\d+)-[0-9a-f]+")
@@ -163,7 +164,7 @@ def choose_superseded(
 
 def count_freed_bytes(removed: Sequence[MapRecord]) -> int:
     """Return by how many bytes the charge of a tenant decreases when the versions *removed* are gone."""
-    sizes = {record.digest: record.size for record in removed}  # Versions may share their bytes.
+    sizes = {record.digest: record.size for record in removed}  # Count bytes that versions share once.
     return sum(map(charge_of, sizes.values())) + len(removed) * MIN_CHARGE_BYTES
 
 

@@ -45,31 +45,34 @@ _FLAGS = {"avx512": 0, "avx2": 4, "portable": 1}
 """Flag of a request by the widest vector instructions that the core may use for it; a processor without them
 uses narrower ones."""
 
-# --- Layout of rse_pf_pnp_request ---
-_HEAD = struct.Struct("=IIq")  # abi, flags, rows
+# --- Layout of the C struct rse_pf_pnp_request ---
+_HEAD = struct.Struct("=IIq")  # version of the C interface, flags, number of correspondences
 _ARRAYS = struct.Struct("=QQ")  # addresses of points_world and pixels
 _POINTER = struct.Struct("=Q")  # address of T_camera_world; 0: estimate a pose
 _BODY = struct.Struct("=Qddddiiddiidddd")  # T_camera_world, then intrinsics, image size and options
 _BODY_AT = _HEAD.size + _ARRAYS.size  # byte offset of _BODY, and of _POINTER, its first field
 _REQUEST_BYTES = _BODY_AT + _BODY.size
 
-# --- Layout of rse_pf_pnp_result ---
+# --- Layout of the C struct rse_pf_pnp_result ---
 _RESULT = struct.Struct("=iiqqqdddddd")  # the fields of _ResultHead
 _POSE_AT = _RESULT.size  # byte offset of T_camera_world
 _COVARIANCE_AT = _POSE_AT + 16 * 8  # byte offset of covariance
 _UPPER_AT = _COVARIANCE_AT + 36 * 8  # byte offset of upper_triangle
 _RESULT_BYTES = _UPPER_AT + 22 * 4
 
-# --- Layout of rse_pf_lists ---
-_LISTS_HEAD = struct.Struct("=Qq")  # address of numbers, and for how many numbers there is room
+# --- Layout of the C struct rse_pf_lists ---
+_LISTS_HEAD = struct.Struct("=Qq")  # address of the array ``numbers``, and its length
 _LIST_ENDS = struct.Struct("=qqqq")  # number of lists, then for each of three lists the end of its numbers
-_REST_AT = _LISTS_HEAD.size + _LIST_ENDS.size  # byte offset of rest
-_MAX_REST_BYTES = 1024  # size of the JSON text without its lists: RSE_PF_MAX_REST of the C header
+_REST_AT = _LISTS_HEAD.size + _LIST_ENDS.size  # byte offset of ``rest``, the JSON text without its lists
+# Most bytes of a JSON text besides its lists: RSE_PF_MAX_REST of the C header.  Of a text with more bytes,
+# `NativeSolver.cut_lists` cuts no list, and the JSON parser reads the whole text, which takes longer.
+_MAX_REST_BYTES = 1024
 
 # Correspondences for which the arrays of a thread have room at first; a longer request enlarges the arrays.
 _FIRST_ROWS = 512
 # Most numbers in all lists of one JSON text: 5,000 correspondences of a point (3 numbers), a pixel (2) and a
-# depth (1).
+# depth (1).  A text with more numbers is not refused: `NativeSolver.cut_lists` cuts no list of it, and the
+# JSON parser reads the whole text, which takes longer.
 _MAX_NUMBERS = 30_000
 
 _REASONS = (
@@ -284,7 +287,7 @@ class _Buffers(threading.local):
         """Replace the arrays by uninitialised ones for *rows* correspondences, and write their addresses."""
         points_world, pixels = np.empty(3 * rows), np.empty(2 * rows)
         inliers = np.empty(rows, dtype=np.uint32)
-        # All allocations come first: if one fails, the request keeps the addresses of the old arrays.
+        # Write the addresses after all allocations: if one fails, the request keeps those of the old arrays.
         _ARRAYS.pack_into(self.request, _HEAD.size, address_of(points_world), address_of(pixels))
         self.points_world, self.pixels = points_world, pixels
         self.inliers, self.inliers_address, self.rows = inliers, address_of(inliers), rows
@@ -335,7 +338,8 @@ class NativeSolver:
         self._solve_function, self._cut_function = solve_function, cut_function
         self._buffers, self._lists = _Buffers(), _ListBuffers()
         self.lanes = lanes
-        """Widest vector instructions that the core uses here: ``avx512``, ``avx2`` or ``portable``."""
+        """Widest vector instructions that the core uses on this processor: ``avx512``, ``avx2`` or
+        ``portable``."""
 
     def solve(
         self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions
@@ -416,8 +420,8 @@ class NativeSolver:
     ) -> tuple[tuple[Any, ...], npt.NDArray[np.uint32]]:
         """Call the core; return the numbers of `_ResultHead`, and a copy of the row numbers of the inliers.
 
-        Pose and covariance stay in the buffers until the next call of this thread.  Without *pose* the core
-        estimates one.
+        Pose and covariance stay in the buffers until the next call of this thread.  If *pose* is None, the
+        core estimates a pose; otherwise it measures the evidence of *pose*, ``(4, 4)``.
         """
         n = pixels.size // 2
         if points_world.size != 3 * n or pixels.size != 2 * n:
@@ -447,7 +451,7 @@ class NativeSolver:
             thread overwrites the view, but not the arrays.  None if the text must be parsed as usual: it has
             more than three lists, more than 30,000 numbers in them, or a list that is empty or holds anything
             but numbers; a number is ``-0``, or has more than 15 digits or an exponent; the text has a
-            backslash, or more than 1,024 bytes besides the lists.
+            backslash, or more than 1,024 bytes besides the lists.  Such a text is not refused here.
         """
         buffers = self._lists
         size = self._cut_function(text, len(text), buffers.lists_address)

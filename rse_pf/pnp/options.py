@@ -43,7 +43,7 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     engine: Literal["native", "opencv"] | None = None
     inlier_px: float = 8.0
     max_iterations: int = 1000
-    # Above max_iterations, min_iterations counts as max_iterations; OpenCV's estimate does not use it.
+    # A min_iterations above max_iterations counts as max_iterations; the engine ``opencv`` ignores it.
     min_iterations: int = 10
     confidence: float = 0.999
 

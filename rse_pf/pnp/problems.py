@@ -22,7 +22,9 @@ KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=48
 
 _MIN_DEPTH_M = 0.8  # nearest point of a problem, metres: the shortest range of a Kinect
 _MAX_DEPTH_M = 6.0  # farthest point of a problem, metres: the size of a room
-_BORDER_PX = 8.0  # pixels along the border of the image without points, so that noise keeps them inside
+# Width (pixels) of the border of the image on which no point is projected before noise is added, so that the
+# noisy pixels of inliers lie inside the image.
+_BORDER_PX = 8.0
 
 DEGENERATE = (
     "collinear",

@@ -22,7 +22,8 @@ __all__ = ["Rule", "evaluate_rules"]
 # The constants of this block repeat constants of native/src/evidence.hpp and native/src/solve.hpp: change
 # them together.
 
-# Largest log10 of the expected number of random poses that fit as well as an accepted pose.
+# Largest log10 of the expected number of random poses that fit as well as an accepted pose: 1e-5 poses.  A
+# pose above it is refused as ``no-consensus``.
 _MAX_LOG10_FALSE_ALARMS = -5.0
 # Width over length of the inlier pixels below which a pose is weak.
 _WEAK_WIDTH_TO_LENGTH = 0.1
@@ -32,8 +33,9 @@ _EQUAL_FIT = 9.0
 # Smallest increase of the sum of squared reprojection errors from a pose to the second pose of a planar
 # scene, in units of the pixel variance, with which the pose is ok instead of weak.
 _SIMILAR_FIT = 40.0
-# Smallest pixel variance (px^2) that is derived from the reprojection errors: pixels in messages are rounded
-# to 0.01 px, and four points may fit by luck.
+# Smallest pixel variance (px^2) by which this increase is divided.  The variance is estimated from the
+# reprojection errors of the inliers; a smaller estimate is replaced by this value, because pixels in messages
+# are rounded to 0.01 px, and four points may fit by luck.
 _MIN_VARIANCE_PX2 = 0.01
 
 
@@ -178,7 +180,8 @@ def _ambiguity_rules(evidence: Evidence) -> tuple[Rule, ...]:
     """Return the rules that compare the pose with the second pose of a planar scene by a likelihood ratio.
 
     The measured value is the increase of the sum of squared reprojection errors of the inliers from the pose
-    to the second pose, divided by the pixel variance.  Without a second pose there is no rule.
+    to the second pose, divided by the pixel variance (at least `_MIN_VARIANCE_PX2`).  Without a second pose
+    there is no rule.
     """
     if not evidence.second_pose_rmse_px:
         return ()

@@ -28,9 +28,9 @@ _CENTRE_DEVIATION = 0.1  # prior standard deviation of the principal point, as a
 _SHUTTER_DEVIATION_PX = 20.0
 """Prior standard deviation, px, of the shift between the first and the last row of an image that a rolling
 shutter and the motion of the camera cause."""
-# Smallest depth in metres with which a point is projected, also a nearer one or one behind the camera.
+# Depth in metres at which a point is projected that is nearer than this depth, or behind the camera.
 _MIN_DEPTH_M = 0.05
-_MIN_VARIANCE_PX2 = 0.1  # smallest variance of a pixel, px^2, that is assumed however well all matches fit
+_MIN_VARIANCE_PX2 = 0.1  # smallest variance of a pixel, px^2: it replaces a smaller one that matches suggest
 _CORRELATION_FACTOR = 5.0
 """Factor by which the variance of a pose is larger than the variance that is computed with the assumption
 that the errors of all matches are independent.  The factor was measured.  The errors are not independent:
@@ -88,7 +88,8 @@ def fit_camera(
         for Robust Spatial Perception, 2020.  Correction of the information for noise of the points: Fuller,
         Measurement Error Models, 1987, Sect. 2.2.
     """
-    # 1. Fit twice from different scales of the loss; the lower cost wins.
+    # 1. Fit twice, from each of `_FIRST_SCALES_PX` as the first scale of the loss, with a prior of these
+    #    standard deviations on the camera; take the fit with the lower cost.
     deviations = [
         _LOG_FOCAL_DEVIATION,
         *[_CENTRE_DEVIATION * camera.width] * 2,
@@ -157,7 +158,10 @@ class _Fit:
         self.cost = scale_px**2 * float((ratios / (1.0 + ratios)).sum())
 
     def jacobian_and_errors(self, points_map: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
-        """Return Jacobian ``(n, 2, 11)`` and errors ``(n, 2)``, px, for points ``(n, 3)`` of the map."""
+        """Return Jacobian ``(n, 2, 11)`` and errors ``(n, 2)``, px, of points ``(n, 3)`` of the map.
+
+        Both are those at the pose and the camera of this fit, *camera* being the stated camera.
+        """
         points = transform(self.T_camera_map, points_map)
         depths = np.maximum(points[:, 2], _MIN_DEPTH_M)
         rays = points[:, :2] / depths[:, None]
@@ -176,7 +180,10 @@ def _adjust(
     prior_information: Array,
     first_scale_px: float,
 ) -> _Fit:
-    """Return pose and camera after Gauss-Newton steps on a loss whose scale shrinks to `_LAST_SCALE_PX`."""
+    """Return pose and camera after Gauss-Newton steps on a loss whose scale shrinks to `_LAST_SCALE_PX`.
+
+    *prior_information* ``(5,)`` draws the camera towards the stated *camera*.
+    """
     T_camera_map, camera_change, scale_px = inverse(T_map_camera), np.zeros(5), first_scale_px
     for _ in range(_ITERATIONS):
         # The prior on the camera is multiplied by the square of last scale / scale: it is weak at first, so

@@ -112,16 +112,17 @@ def find_observers(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[
 def voxel_keys(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
     """Return a key of the voxel of each point: one number, or three if one cannot hold it.
 
-    Two points lie in the same voxel if and only if their keys are equal.  Voxels are counted from the
-    smallest coordinates of these points, so that the keys of two calls cannot be compared.
+    Two points lie in the same voxel if and only if their keys are equal.  Along each axis, voxels are counted
+    from that of the smallest coordinate of these points, or from that of 0 if all coordinates are positive.
+    Therefore the keys of two calls cannot be compared.
 
     Args:
         points: ``(n, 3)`` metres.
         voxel_m: Edge of a voxel.
 
     Returns:
-        ``(n,)`` numbers whose order is that of the voxel indices along x, then y, then z.  If the points span
-        more than 2**21 voxels along an axis: ``(n, 3)``, the voxel indices along x, y and z.
+        ``(n,)`` numbers whose order is that of the voxel indices along x, then y, then z.  If an index is
+        2**21 or more: ``(n, 3)``, the voxel indices along x, y and z.
     """
     voxels = np.floor(points / voxel_m).astype(np.int64)
     voxels -= voxels.min(axis=0, initial=0)

@@ -196,7 +196,8 @@ def are_pairwise_consistent(
     # 1. Compute the odometry between the ends of both loop closures.
     along_b = inverse(T[reference.b]) @ T[edges.b]
     along_a = inverse(T[edges.a]) @ T[reference.a]
-    # 2. Where units of length differ, compute the mean of both measured scales and its variance.
+    # 2. Where units of length differ, compute the mean of both measured scales and its variance; elsewhere
+    #    the scales count as equal.
     scale_difference2, mean_scale_variance, scale_variance = np.zeros(1), np.zeros(1), np.ones(1)
     if edges.scales is not None and reference.scales is not None:
         difference = (edges.scales - reference.scales)[:, 0]
@@ -284,7 +285,8 @@ def find_maximum_clique(adjacency: npt.NDArray[np.bool_]) -> npt.NDArray[np.int6
     while stack:
         clique, candidates = stack[-1]
         vertex, colours = candidates.pop() if candidates else (-1, 0)
-        # 1. Give this branch up if no clique in it can be larger.
+        # 1. Leave this branch if no clique in it can be larger than the largest one found so far, or if the
+        #    search has used all its branches.
         if len(clique) + colours <= len(largest) or branches_left <= 0:
             stack.pop()
             continue
@@ -292,7 +294,7 @@ def find_maximum_clique(adjacency: npt.NDArray[np.bool_]) -> npt.NDArray[np.int6
         branches_left -= 1
         grown = [*clique, vertex]
         largest = max(largest, grown, key=len)
-        # 3. Go on with the candidates that are neighbours of the vertex.
+        # 3. Go on with the clique that has this vertex; its candidates are the neighbours of the vertex.
         remaining = [candidate for candidate, _ in candidates if candidate in neighbours[vertex]]
         stack.append((grown, _colour_vertices(remaining, neighbours, adjacency)))
     return np.array(sorted(largest), dtype=np.int64)

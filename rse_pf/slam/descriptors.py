@@ -38,7 +38,8 @@ _INSTRUCTION_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 """Flag of a call of ``rse_pf_match`` of the native core, by the widest vector instructions that the core may
 use: 1 forbids AVX2 and AVX-512, 2 forbids AVX-512, and 0 forbids nothing."""
 _BLOCK_DISTANCES = 4_000_000
-"""Largest number of distances in memory at a time where numpy matches descriptors: 16 MB of float32."""
+"""Largest number of distances in memory at a time where numpy matches descriptors: 16 MB of float32.  More
+distances are computed in blocks of rows."""
 _BIT_COUNTS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 _WORKSPACE = Workspace()
 _POINTER = ctypes.c_void_p
@@ -60,7 +61,10 @@ def distance_bound(descriptors: Descriptors) -> int:
 
 
 def distances_of_pairs(first: Descriptors, second: Descriptors) -> npt.NDArray[np.int64]:
-    """Return the ``(n,)`` distances between row *i* of one and row *i* of another ``(n, d)`` array."""
+    """Return the ``(n,)`` distances between row *i* of one and row *i* of another ``(n, d)`` array.
+
+    They are Hamming distances of uint8, and squared Euclidean distances of int8.
+    """
     if first.dtype == np.uint8:
         bits: npt.NDArray[np.int64] = _BIT_COUNTS[first ^ second].sum(axis=1, dtype=np.int64)
         return bits
@@ -135,7 +139,7 @@ def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tup
 
 
 def _match_by_numpy(reference: Descriptors, view: Descriptors, ratio: float) -> tuple[Rows, Rows]:
-    """Match descriptors of any kind, as `best_matches` describes."""
+    """Match descriptors of a kind other than ORB, as `best_matches` describes."""
     step = max(1, _BLOCK_DISTANCES // len(view))
     blocks = [_find_two_nearest(reference[row : row + step], view) for row in range(0, len(reference), step)]
     best, second, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
@@ -192,8 +196,9 @@ def match_all(
         first: ``(n, d)``.
         second: ``(m, d)``.
         ratio: Lowe's ratio test, as in `best_matches`.
-        max_distance: Largest Hamming distance in bits of 256; scaled for binary descriptors of other lengths,
-            not used for vectors.
+        max_distance: Largest Hamming distance of a match of ORB descriptors, of 256 bits; a match with a
+            larger one is left out.  The limit is proportional to the length of other binary descriptors, and
+            does not apply to vectors.
 
     Returns:
         Ascending rows of *first*, and the row of *second* that matches each of them.

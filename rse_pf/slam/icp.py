@@ -20,8 +20,8 @@ from rse_pf.geometry import Array, pose_difference, transform
 __all__ = ["CloudAlignment", "IcpOptions", "align_clouds", "load_small_gicp"]
 
 _MIN_POINTS = 100
-"""Smallest number of points of a thinned cloud, and of correspondences between two clouds, for an
-alignment."""
+"""Smallest number of points of a thinned cloud, and of correspondences between two clouds.  Fewer points are
+an error; with fewer correspondences a refined pose is rejected."""
 _NEIGHBOURS = 20  # number of nearest points from which the normal and covariance of a point are estimated
 _MIN_GAIN = 0.02
 """Tolerance of the comparison of the mean distances between the clouds at the refined and at the initial
@@ -51,7 +51,8 @@ class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         reach_m: Largest distance between corresponding points, voxel_m..100 m.
         max_iterations: Most iterations of the solver in each of its two stages, 1..1000.  The first stage
             uses *reach_m*, the second one a third of it, but at least two voxels.
-        min_overlap: Share of the source points that need a correspondence, 0.05..1.
+        min_overlap: Smallest share of the thinned source points with a correspondence at an accepted pose,
+            0.05..1.
         max_motion_m: Largest translation from the initial pose to an accepted one, metres, above 0.
         max_motion_deg: Largest rotation from the initial pose to an accepted one, degrees, above 0 and up to
             180.
@@ -97,7 +98,8 @@ class CloudAlignment:
             not constrain the pose; "jumped": it is too far from the initial pose; "not-converged".
         overlap: Share of the thinned source points with a target point within ``reach_m``, at the refined
             pose, also if it was rejected.
-        misfit_before_m: Mean distance of source points to the target's surface at the initial pose.
+        misfit_before_m: Mean distance of source points to the target's surface at the initial pose; a point
+            without a correspondence counts as ``reach_m``.
         misfit_after_m: Mean distance of source points to the target's surface at the refined pose, also if it
             was rejected.
         iterations: Iterations of the solver in both stages together.
@@ -169,7 +171,7 @@ def align_clouds(
         )
         pose, has_converged = np.asarray(result.T_target_source), bool(result.converged)
         iterations += int(result.iterations)
-    # 3. Accept the pose only if it fits better and is constrained.
+    # 3. Measure the fit at the refined pose, and reject the pose or accept it.
     after = surfaces.measure_fit(pose) if np.isfinite(pose).all() else _Fit(0.0, math.inf)
     reason = "" if has_converged else "not-converged"
     reason = reason or _rejection(
@@ -229,6 +231,7 @@ class _Surfaces:
     def _correspondences(self, T_target_source: Array) -> tuple[npt.NDArray[np.bool_], Array, Array, Array]:
         """Return for each source point whether it has a correspondence, and its point-to-plane distance.
 
+        A point has a correspondence if a target point is within ``reach_m`` of it.
         The last two arrays are the source points in the target's frame, and the normal of the nearest target
         point of each.  A point without correspondence has numbers, too, which mean nothing.
         """

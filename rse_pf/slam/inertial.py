@@ -41,9 +41,12 @@ _MOUNT_STRUCT = struct.Struct("<6f")
 _MOTION_STRUCT = struct.Struct("<61f")
 _TRIANGLE = np.triu_indices(9)
 _MIN_GRAVITY_DEVIATION_RAD = 1e-4
-"""Smallest standard deviation in radians of a direction of gravity: no IMU is more accurate."""
+"""Smallest accepted standard deviation in radians of a direction of gravity: no IMU is more accurate.  An IMU
+block with a smaller one is refused."""
 _MAX_GRAVITY_DEVIATION_RAD = 0.35
-"""Largest standard deviation in radians of a direction of gravity: beyond 20 degrees it is useless."""
+"""Largest accepted standard deviation in radians of a direction of gravity: beyond 20 degrees it is useless.
+An IMU block with a larger one is refused."""
+# `decode_imu` refuses a block with a number beyond one of the following limits.
 _MAX_ROTATION_RAD = 3.2  # largest length of a rotation vector in radians: pi, and room for rounding
 _MAX_DURATION_S = 60.0  # longest preintegrated motion in seconds: an IMU drifts too far in a longer time
 _MAX_VELOCITY_M_S = 1e3  # largest coordinate of the velocity of a preintegrated motion in m/s
@@ -51,9 +54,10 @@ _MAX_POSITION_M = 1e4  # largest coordinate of the position of a preintegrated m
 _MAX_LEVER_ARM_M = 10.0  # largest distance in metres of the IMU from the camera on one robot
 _MAX_BIAS = 10.0  # largest bias of a gyroscope in rad/s, or of an accelerometer in m/s^2
 _MAX_MOTION_DEVIATION = 1e3
-"""Largest standard deviation of a preintegrated rotation (rad), velocity (m/s) or position (m)."""
+"""Largest standard deviation of a preintegrated rotation (rad), velocity (m/s) or position (m): above it, the
+motion says nothing, and its block is refused."""
 _MAX_GRAVITY_DIFFERENCE_DEG = 5.0
-"""Largest angle in degrees between two directions of gravity that agree."""
+"""Largest angle in degrees between the directions of gravity of two robots that agree (`agreed_gravity`)."""
 _MAX_DIRECTIONS = 200
 """Largest number of directions of gravity whose median is computed; of more, an even selection is taken,
 which bounds time and memory."""
@@ -212,7 +216,7 @@ def _median_direction(directions: Array) -> Array:
 
 
 def _decode_motion(numbers: Array) -> InertialMotion:
-    """Return the motion of the 61 numbers of its encoding; raises BadRequest."""
+    """Return the motion of the 61 numbers of its encoding; raises BadRequest if one is impossible."""
     duration_s = float(numbers[0])
     rotation, velocity, position = numbers[1:4], numbers[4:7], numbers[7:10]
     biases = numbers[10:16]

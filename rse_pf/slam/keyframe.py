@@ -67,13 +67,15 @@ __all__ = [
 ]
 
 MAX_KEYFRAME_BYTES = 36_000
-"""Largest size in bytes of one encoded keyframe; the 894 ORB features that a robot sends by default need
-33.3 kB."""
+"""Largest size in bytes of one encoded keyframe: the 894 ORB features that a robot sends by default need
+33.3 kB.  A larger keyframe is refused."""
 MAX_FEATURES = 894
 """Largest number of features of one keyframe with ORB descriptors; for other kinds of descriptors,
-`max_features` returns the number."""
+`max_features` returns the number.  Of more features a robot sends the first ones; a keyframe that holds more
+is refused."""
 MAX_BLOCKS = 16
-"""Largest number of blocks in one encoded keyframe; this release knows seven kinds of blocks."""
+"""Largest number of blocks in one encoded keyframe, a keyframe with more is refused: this release knows seven
+kinds of blocks."""
 
 _MAGIC = b"KF"  # the first two bytes of an encoded keyframe
 _VERSION = 2  # version of the encoding of keyframes, the only one that is read and written
@@ -117,12 +119,13 @@ _MAX_FEATURES_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)
 """Largest encoded size in bytes of all features of one keyframe, whatever their kind: that of 894 ORB
 features."""
 _FINEST_PIXEL_FRACTION = 4
-"""Exponent of the finest unit of encoded pixels: 2**-4 px, for images up to 4,095 px wide."""
+"""Exponent of the finest unit of encoded pixels: 2**-4 px, where no coordinate is above 4,095 px."""
 _COARSEST_PIXEL_FRACTION = 2
-"""Exponent of the coarsest unit of encoded pixels: 2**-2 px, for images up to 16,383 px wide."""
+"""Exponent of the coarsest unit of encoded pixels: 2**-2 px, where no coordinate is above 16,383 px."""
 _BORDER_PX = 64
-"""Largest distance in pixels of an undistorted feature beyond the right or the lower edge of the image.
-Beyond the left or the upper edge a coordinate would be negative, which the encoding does not hold."""
+"""Largest distance in pixels of an undistorted feature beyond the right or the lower edge of the image; a
+keyframe with a farther one is refused.  Beyond the left or the upper edge a coordinate would be negative,
+which the encoding does not hold."""
 _DISPARITY_STEPS_PER_PX = 64  # disparities are encoded in units of 1/64 px
 _MAX_STEPS = 65_535  # largest number that encodes a depth or a disparity: a uint16
 _MIN_DEPTH_MM = 10  # smallest depth of a depth camera that is encoded, in millimetres
@@ -139,11 +142,11 @@ _MIN_UNIT = 1e-9
 _MAX_UNIT = 1e3
 """Largest quantisation step of depths without metric scale, in the unit of length of their segment."""
 _MAX_TIME_S = 1e12
-"""Largest time of a keyframe in seconds after or before 1970; larger numbers overflow in later
-computations."""
+"""Largest time of a keyframe in seconds after or before 1970, far beyond any clock: a keyframe with another
+time is refused."""
 _MAX_ODOMETRY_M = 1e6
-"""Largest coordinate in metres of a camera in the odometry of its robot: no robot drives 1,000 km in one
-run."""
+"""Largest coordinate in metres of a camera in the odometry of its robot: no robot drives 1,000 km in one run.
+`check_odometry_range` refuses a keyframe beyond it."""
 _KINECT_NOISE = DepthNoise()
 
 
@@ -291,9 +294,10 @@ def make_features(
 ) -> KeyframeFeatures:
     """Return the features of a keyframe, rounded as they are encoded, without those that cannot be encoded.
 
-    Pixels are rounded to 1/16 px (1/8 or 1/4 px in images wider than 4,095 px), depths to 1 mm, or their
-    disparities to 1/64 px.  Of more than `max_features` features the first ones are used.  ORB returns the
-    features of the finest pyramid level first, and features of that level give the most loop closures.
+    Pixels are rounded to 1/16 px (to 1/8 or 1/4 px if a coordinate of one of them is above 4,095 px), depths
+    to 1 mm, or their disparities to 1/64 px.  Of more than `max_features` features the first ones are used.
+    ORB returns the features of the finest pyramid level first, and features of that level give the most loop
+    closures.
 
     Args:
         pixels: ``(n, 2)``, undistorted; features outside 0..16383 px are left out.
@@ -367,7 +371,8 @@ def make_scaleless_features(
         is_usable = _is_encodable_pixel(pixels)
         known_depths = np.where(np.isfinite(depths) & (depths > 0.0), depths, 0.0)
     has_depth = is_usable & (known_depths > 0.0)
-    # 2. Choose the unit so that the farthest accurate depth is the largest number of the encoding.
+    # 2. Choose the unit so that the largest number of the encoding stands for the farthest depth that is
+    #    encoded: the largest depth, but at most 16 times the median depth.
     max_depth = _MAX_MEDIAN_DEPTHS * float(np.median(known_depths[has_depth])) if has_depth.any() else 1.0
     unit = min(max_depth, float(known_depths[has_depth].max(initial=0.0)) or 1.0) / _MAX_STEPS
     if not _MIN_UNIT <= unit <= _MAX_UNIT:
@@ -376,7 +381,7 @@ def make_scaleless_features(
             f"{_MAX_UNIT * _MAX_STEPS:g} units of length of the segment",
             hint="choose a unit of the segment in which depths are around 1",
         )
-    # 3. Round the depths; those beyond the farthest accurate depth become unknown.
+    # 3. Round the depths; those beyond 16 times the median depth become unknown.
     steps = np.rint(np.where(has_depth & (known_depths <= max_depth), known_depths, 0.0) / unit)
     steps = np.where(steps <= _MAX_STEPS, steps, 0.0)
     # 4. Take the features with a depth, then those without, up to the number that a keyframe can have.

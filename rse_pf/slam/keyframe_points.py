@@ -37,7 +37,9 @@ __all__ = [
     "encode_reference",
 ]
 
-MAX_POINTS = 16_000  # largest number of coloured points of one keyframe
+# Largest number of coloured points of one keyframe; the encoder takes an even selection of more points, and
+# the decoder refuses an object with more.
+MAX_POINTS = 16_000
 MAX_POINTS_BYTES = 160_000
 """Largest size in bytes of the object with the coloured points of one keyframe.  16,000 points have 144,008
 bytes without compression (8 of the head, 9 for each point), so that the limit refuses no valid object."""
@@ -137,7 +139,7 @@ def decode_points(data: bytes, camera: Camera) -> tuple[Array, Colours]:
         BadRequest: *data* is longer than 160,000 bytes or malformed, holds more than 16,000 points, or a
             point outside the image.
     """
-    # 1. Check the head, and decompress with a limit of the size.
+    # 1. Check the head, and decompress no more bytes than the stated number of points has.
     if not _HEAD_STRUCT.size <= len(data) <= MAX_POINTS_BYTES:
         raise _bad_points(f"{len(data)} bytes are not within {_HEAD_STRUCT.size}..{MAX_POINTS_BYTES}")
     magic, version, zero, n = _HEAD_STRUCT.unpack_from(data)

@@ -24,8 +24,8 @@ the length is 1 if all cameras are held alike, and about 0 if they are held in a
 # --- Limits of `level_surface_normal`, which finds horizontal surfaces by the normals of small voxels ---
 _VOXEL_M = 0.15  # edge in metres of the voxels in which surface normals are estimated
 _MAX_POINTS = 500_000
-"""Largest number of points in which level surfaces are looked for; a larger cloud is thinned evenly, to
-bound the time."""
+"""Number of points from twice which on a cloud is thinned evenly before level surfaces are looked for, which
+bounds the time; at least this number and fewer than twice as many points are left."""
 _MIN_VOXEL_POINTS = 12  # smallest number of points of a voxel from which a surface normal is estimated
 _MIN_VOXELS = 20  # smallest number of flat voxels with similar normals that count as level surfaces
 _MAX_FLATNESS_RATIO = 0.02
@@ -36,14 +36,17 @@ _MAX_LEVEL_TILT_DEG = 30.0
 beyond it."""
 _MAX_NORMAL_DIFFERENCE_DEG = 5.0
 """Largest angle in degrees between two surface normals that support the same direction."""
-_MAX_HYPOTHESES = 500  # largest number of normals that are tried as the common direction; bounds the time
+# Number of normals from twice which on only an even selection of them is tried as the common direction, which
+# bounds the time; the selection has at least this number and fewer than twice as many normals.
+_MAX_HYPOTHESES = 500
 
 # --- Limits of `floor_normal`, which fits a plane to the lowest points ---
 _CELL_M = 0.25
 """Edge in metres of the horizontal cells in which the floor is looked for; one low point of each cell is
 used."""
 _MIN_CELL_POINTS = 10
-"""Smallest number of points of a cell of the floor: of fewer, the lowest may be an outlier."""
+"""Smallest number of points of a cell of the floor; a cell with fewer is left out, because its low point may
+be an outlier."""
 _MIN_CELLS = 40  # smallest number of cells that must lie on the plane of the floor
 _TUKEY_LIMITS_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Distances in metres from the plane of the floor at which the weight of a cell becomes 0, for the successive
@@ -148,7 +151,7 @@ def floor_normal(points: npt.NDArray[np.float32], up: Array, camera_positions: A
     Args:
         points: ``(n, 3)`` metres.
         up: ``(3,)`` unit vector against gravity, accurate to some degrees.
-        camera_positions: ``(k, 3)`` metres.
+        camera_positions: ``(k, 3)`` metres; only points below the median height of the cameras are used.
 
     Returns:
         None if fewer than half of the cells lie on one plane, as with stairs and several storeys, if they are

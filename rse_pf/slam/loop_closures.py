@@ -53,7 +53,8 @@ reason."""
 
 MAX_PAIRS = 700_000
 """Largest product of the number of keyframes, the number of maps and `MergeOptions.candidates`.  A merge
-compares at most so many pairs of keyframes, and the comparison of a pair takes some milliseconds."""
+compares at most so many pairs of keyframes, each for some milliseconds; a merge with a larger product is
+refused."""
 WEAK_POSE_VARIANCE = 4.0
 """Factor by which the covariance of a relative pose that PnP calls weak is multiplied; standard deviations
 become twice as large.  In rendered worlds the errors of such poses were typically 1.2 to 1.7 times, and at
@@ -222,8 +223,9 @@ def measure_pairs(
     options: MergeOptions,
     report: Report = ignore_progress,
 ) -> tuple[list[LoopClosure], RejectionCounts]:
-    """Return the loop closures of those *pairs* of rows that PnP can measure, and why the others failed.
+    """Return the loop closures of those *pairs* of rows that PnP can measure, and count the other pairs.
 
+    The other pairs are counted by their maps and the reason why no relative pose was measured.
     The landmarks of the first keyframe of a pair are matched with the image of the second.  *report* receives
     the progress within 0 to 1, and a text.
     """
@@ -303,7 +305,10 @@ def _find_fitting_odometry(
     loop_closures: Sequence[LoopClosure],
     noise: OdometryNoise,
 ) -> list[int]:
-    """Return the indices of the loop closures that agree with odometry by `fits_prediction`."""
+    """Return the indices of the loop closures that agree with odometry by `fits_prediction`.
+
+    The poses *T_world_camera* ``(n, 4, 4)`` of the keyframes predict the relative poses.
+    """
     if not loop_closures:
         return []
     edges = EdgeArrays.of(loop_closures)

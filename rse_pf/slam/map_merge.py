@@ -86,7 +86,7 @@ class MergedMap:
 def _group_by_maps(
     atlas: Atlas, loop_closures: Sequence[LoopClosure]
 ) -> dict[tuple[int, int], list[LoopClosure]]:
-    """Return the loop closures by the indices of the two maps that they connect."""
+    """Return the loop closures by the indices of the two maps that they connect, the smaller one first."""
     groups: dict[tuple[int, int], list[LoopClosure]] = {}
     for closure in loop_closures:
         groups.setdefault(map_pair_of(atlas, closure.a, closure.b), []).append(closure)
@@ -174,7 +174,8 @@ def merge_versions(
     T_world_camera, joined = _align_maps(atlas, accepted)
     used = [c for c in accepted if {int(atlas.of_map[c.a]), int(atlas.of_map[c.b])} <= joined]
     rows = np.flatnonzero(np.isin(atlas.of_map, sorted(joined)))
-    # 3. Add loop closures from aligned point clouds, and optimise the pose graph of all edges.
+    # 3. Collect the edges of the joined maps, add loop closures from aligned point clouds, and optimise the
+    #    pose graph of all these edges.
     odometry = _odometry_edges(atlas, versions, joined)
     used += steps.align(atlas, T_world_camera, used)
     graph = _make_graph(atlas, T_world_camera, rows, odometry, used)
@@ -243,7 +244,7 @@ def _proposed_pose(atlas: Atlas, T_world_camera: Array, closure: LoopClosure, ne
 def _odometry_edges(
     atlas: Atlas, versions: Sequence[MapVersion], joined: set[int]
 ) -> list[tuple[LoopClosure, EdgeKind]]:
-    """Return the edges of the joined maps with their kinds.
+    """Return the edges of the joined maps, of all kinds (also loop closures), each with its kind.
 
     Consecutive keyframes of a robot without an edge get one from their poses.
 

@@ -175,7 +175,7 @@ def _minimise(
     try:
         factors = _make_factors(gtsam, graph, anchors, options.cauchy)
         optimised = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
-    except RuntimeError:  # GTSAM raises it for an indeterminate linear system.
+    except RuntimeError:  # GTSAM found an indeterminate linear system: there are no poses from this start.
         return None
     return np.array([optimised.atPose3(row).matrix() for row in range(len(T_world_pose))])
 
@@ -190,7 +190,7 @@ def _chordal_poses(gtsam: Any, graph: PoseGraph, anchors: Rows) -> Array | None:
         return None
     try:
         values = gtsam.InitializePose3.initialize(_make_factors(gtsam, graph, anchors, 0.0))
-    except RuntimeError:  # GTSAM raises it for a graph without loops.
+    except RuntimeError:  # The graph has no loops, for which GTSAM has no chordal relaxation.
         return None
     poses = np.array([values.atPose3(row).matrix() for row in range(len(graph.T_world_pose))])
     return poses if np.isfinite(poses).all() else None
