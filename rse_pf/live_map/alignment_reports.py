@@ -47,7 +47,7 @@ def report_alignments(
     for row, T_map_odom, has_changed in _find_alignments(graph):
         segment = graph.segments[row]
         is_reported = segment.reported_T_map_odom is not None
-        # 1. Report a segment whose connection with the map was lost.
+        # 1. Of a segment that is not connected with the map, report only that its alignment was lost.
         if not graph.is_aligned(row):
             if is_reported:
                 is_metric = segment.component in graph.metric_components
@@ -55,7 +55,8 @@ def report_alignments(
                 reason = segment.reason or default
                 yield Unaligned(robot=segment.robot, segment=segment.number, reason=reason)
             continue
-        # 2. Report that a segment without a reported alignment has one now, or again.
+        # 2. Report that a segment without a reported alignment has one now, or again; leave out a segment
+        #    whose reported alignment has not changed.
         if not is_reported:
             connections = graph.accepted_edges_by_segments().items()
             count = sum(len(numbers) for pair, numbers in connections if row in pair)
@@ -74,7 +75,7 @@ def report_alignments(
 
 
 def alignment_of(segment: Segment) -> Alignment:
-    """Return the alignment of a segment as its robot was last sent it; without one it holds the reason."""
+    """Return the alignment that the robot was last sent for *segment*, or the reason why there is none."""
     is_aligned = segment.reported_T_map_odom is not None
     return Alignment(
         robot=segment.robot,

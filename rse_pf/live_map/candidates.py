@@ -19,7 +19,9 @@ MIN_LOOP_STEPS_UNDER_LOAD = 12.0
 compares them: drift is small over a shorter path, so its loop closure would correct little."""
 SAME_VIEW_M = 0.12  # metres along each axis, at most, between two keyframes with the same view
 SAME_VIEW_DEG = 8.0  # degrees of rotation, at most, between two keyframes with the same view
-MAX_KEYFRAMES_OF_VIEW = 2  # keyframes with the same view that keep their features; more would add nothing
+MAX_KEYFRAMES_OF_VIEW = 2
+"""Keyframes with the same view that keep their features, the newest ones; the features of older ones are
+redundant, and are dropped."""
 
 
 def choose_candidates(

@@ -26,8 +26,8 @@ __all__ = [
 ]
 
 Fit = Literal["agrees", "vague", "contrary"]
-"""How a loop closure within one component fits the pose graph: it *agrees*; or it agrees, but the graph is
-too *vague* to confirm it; or it is *contrary* to the graph."""
+"""How a loop closure within one component fits the pose graph: it *agrees* with the poses of its keyframes;
+or it agrees, but these poses are too uncertain to confirm it (*vague*); or it is *contrary* to them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +42,8 @@ class AddEdges:
 class CompareEdges:
     """State how loop closures of full weight within one component fit the graph; the graph does not change.
 
-    Loop closures at perceptual aliases say nothing about the robot that made them; they are "alias".
+    By ``fits`` a keyframe is recorded as contradicting the map.  Loop closures at perceptual aliases say
+    nothing about the robot that made them; their fit is "alias", which is no contradiction.
     """
 
     fits: set[Fit | Literal["alias"]]
@@ -87,7 +88,7 @@ class MarkAliases:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateReason:
-    """Note why the segments ``rows`` have no alignment; ``is_reported`` says whether it is an outcome."""
+    """Note why the segments ``rows`` have no alignment; if ``is_reported``, also report it as `Ambiguous`."""
 
     rows: Sequence[int]
     reason: str

@@ -50,11 +50,17 @@ __all__ = ["STEP_LENGTH_M", "MapGraph"]
 STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry; `OdometryNoise` is the drift of a step
 STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, as 0.25 m are
 MIN_STEP = 0.05  # steps of odometry that a motion counts as, at least: a stationary robot has some variance
-MAX_PENDING_EDGES = 400  # newest pending loop closures of a map that are kept, to bound memory and CPU time
+MAX_PENDING_EDGES = 400
+"""Most pending loop closures of a map, to bound CPU time.  `MapGraph.drop_oldest_pending` rejects the oldest
+ones beyond this number; like all rejected ones, they are decided again after a robot was forgotten or
+excluded."""
 MAX_REJECTED_EDGES = 2000
-"""Rejected loop closures that are kept, the newest ones.  A map decides about them again after a robot was
-forgotten or excluded; the limit bounds memory and the time of these decisions."""
-MAX_ORPHANED_OBJECTS = 10_000  # newest objects of forgotten robots that are listed for deletion
+"""Most rejected loop closures of a map; those that were rejected first are deleted beyond this number.  A map
+decides about them again after a robot was forgotten or excluded; the limit bounds memory and the time of
+these decisions."""
+MAX_ORPHANED_OBJECTS = 10_000
+"""Most objects of forgotten robots in the list of objects to delete; the oldest entries beyond this number
+are dropped from the list, and their objects are not deleted by it."""
 INHERITED_CONTRADICTIONS = 0xFFFF
 """Bit mask of `Segment.contradictions`: a new segment of a robot inherits the newest 16 bits of its last one,
 so that a hostile robot does not start without a record by opening a segment."""
@@ -163,7 +169,7 @@ class MapGraph:
         return 0 <= i < self._size and bool(self.segment_rows[i] >= 0)
 
     def is_pending(self, number: int) -> bool:
-        """Return whether loop closure *number* is pending; a dropped one is not."""
+        """Return whether loop closure *number* is pending, so neither accepted, rejected nor deleted."""
         return number in self.edges and self.edges[number].state == "pending"
 
     def segment_of(self, i: int) -> Segment:
@@ -440,7 +446,7 @@ class MapGraph:
     # --- Changes of loop closures ---
 
     def apply(self, decisions: Iterable[Decision]) -> list[Outcome]:
-        """Carry out each decision before the next one is made, and return what is reported of them.
+        """Carry out each decision before the next one is made, and return the outcomes of all decisions.
 
         A generator of *decisions* sees the graph as its earlier decisions have changed it.
         """
@@ -546,7 +552,7 @@ class MapGraph:
         self._update_components()
 
     def note_pair_consistency(self, earlier: int, later: int, *, is_consistent: bool) -> None:
-        """Remember whether two pending loop closures agree, so that no pair is tested twice."""
+        """Store whether two pending loop closures agree with each other, so that no pair is tested twice."""
         self.pair_consistency[earlier, later] = is_consistent
 
     def drop_oldest_pending(self) -> None:
@@ -626,7 +632,7 @@ class MapGraph:
             self.components[segment.keyframes] = segment.component
 
     def _drop_pair_consistency(self) -> None:
-        """Drop the known consistency of pairs that are not both pending any more."""
+        """Delete the entries of `pair_consistency` whose loop closures are not both pending any more."""
         pending = set(self.pending)
         self.pair_consistency = {
             pair: is_consistent

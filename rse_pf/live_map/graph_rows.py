@@ -17,8 +17,9 @@ from rse_pf.slam.consistency import evidence_weight
 __all__ = ["NO_LOOP_CLOSURE_YET", "UP_TO_SCALE", "EdgeState", "LiveKeyframe", "LoopEdge", "Segment"]
 
 EdgeState = Literal["pending", "accepted", "rejected"]
-"""State of a loop closure: *pending* ones wait for evidence, *accepted* ones are edges of the pose graph,
-*rejected* ones were taken out as outliers."""
+"""State of a loop closure: *pending* ones wait for other loop closures that support them, *accepted* ones are
+edges of the pose graph, *rejected* ones were taken out as outliers or as the oldest of too many pending
+ones."""
 
 UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
 NO_LOOP_CLOSURE_YET = "no loop closure between its keyframes and the map is accepted yet"
@@ -32,9 +33,11 @@ radians: 2 cm along and 0.7 degrees around each axis, the least noise of one mea
 class LiveKeyframe:
     """A keyframe of one robot in the graph.
 
-    ``segment`` and ``number`` are those of its `KeyframeAdded`.  ``data`` holds the encoded keyframe; it is
-    None after its features were dropped or its robot was forgotten.  ``objects`` are the digests of the
-    objects (points, image) that the robot stored with it; they stay when the features are dropped.
+    ``segment`` and ``number`` are those of its `KeyframeAdded`; of a keyframe of the version that the map
+    started from, -1 and its position in the version.  ``data`` holds the encoded keyframe; it is None after
+    its features were dropped or its robot was forgotten.  ``objects`` are the digests of the objects (points,
+    image) that the robot stored with it; they stay when the features are dropped, and are empty after the
+    robot was forgotten.
     """
 
     robot: str
@@ -57,17 +60,18 @@ class Segment:
     number: int
     keyframes: list[int] = field(default_factory=list)
     component: int = 0
-    """Row of the first segment of the component that this segment belongs to."""
+    """Lowest row of the segments of the component that this segment belongs to."""
     reported_T_map_odom: Array | None = None
     """``(4, 4)``: the alignment with the map that the robot was last sent, None while it has none."""
     covariance: Array = field(default_factory=lambda: DEFAULT_COVARIANCE.copy())
-    """``(6, 6)``: covariance of the reported alignment, of a twist on its left (metres, radians)."""
+    """``(6, 6)``: covariance of the reported alignment, of a twist on its left (m^2, rad^2)."""
     reason: str = NO_LOOP_CLOSURE_YET
-    """Why the segment has no alignment with the map; shown to operators and robots."""
+    """Why the segment has no alignment with the map, empty if it has one; shown to operators and robots."""
     is_from_version: bool = False
     """Whether the keyframes come from the stored version that the map started from."""
     contradictions: int = 0
-    """The newest 32 records of `MapGraph.note_contradiction` as bits, newest lowest; 1 is a contradiction."""
+    """Whether each of the segment's newest 32 recorded keyframes contradicted the map (1) or not (0), as
+    bits, the newest one lowest; a keyframe with a wrong metric scale has two bits."""
     is_excluded: bool = False
     """Whether loop closures of the segment are ignored, because it kept contradicting the map."""
     is_metric: bool = True

@@ -85,7 +85,8 @@ from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["LiveMap"]
 
-MAX_SEGMENTS = 2**31  # segment numbers of a robot are below this, so that they fit into 32 bits
+MAX_SEGMENTS = 2**31
+"""Limit of a robot's segment numbers, which fit into 32 bits: this number and larger ones are refused."""
 RELOCALISATION_POOL = 6
 """Ratio of the keyframes that place recognition proposes to those that a relocalisation compares.  Those
 compared are chosen spread over the map: if two places look the same, both are compared, and the pose is
@@ -284,8 +285,8 @@ class LiveMap:
 
         Raises:
             BadRequest: The keyframe is the next one, and its data are damaged, its segment is older than the
-                newest one of the robot, its odometry is out of range, or its descriptors are of another kind
-                than those of the map.
+                newest one of the robot or has keyframes of the other kind (with or without metric scale), its
+                odometry is out of range, or its descriptors are of another kind than those of the map.
             InvalidCamera: The keyframe is the next one, and its camera model cannot be right.
         """
         expected = self.next_number(event.robot)
@@ -445,7 +446,8 @@ class LiveMap:
         # 1. Add the keyframe to the graph and to the index of place recognition.
         i = graph.add_keyframe(event)
         self._places.add(i, place_vector(event.keyframe.features.descriptors))
-        # 2. Report alignments. Odometry changes none, so only a segment without an alignment can get one.
+        # 2. Report an alignment only if the segment is in the map and the robot was sent no alignment of it;
+        #    an alignment that was sent does not change by a keyframe that odometry adds.
         if graph.segment_of(i).reported_T_map_odom is not None or not self.is_in_map(i):
             return [Added(id=i)]
         return [Added(id=i), *graph.apply(report_alignments(graph, (event.robot, event.number)))]
@@ -467,11 +469,12 @@ class LiveMap:
         if has_jumped:
             measured = []
         # 2. Accept or reject loop closures, join components, and exclude the segment of the robot if it keeps
-        #    contradicting the map; then decide again about all loop closures that are not accepted.
+        #    contradicting the map.  Only after an exclusion, decide again about all that are not accepted.
         outcomes = graph.apply(decide_measured(graph, keyframe, measured, has_jumped=has_jumped))
         is_excluded = graph.segment_of(keyframe).is_excluded and not was_excluded
         decided_again = self._decide_again() if is_excluded else []
-        # 3. Smooth the poses around the changed loop closures.
+        # 3. Smooth the poses around the changed loop closures, and reject the oldest of too many pending
+        #    ones.
         robot, number = graph.keyframes[keyframe].robot, graph.keyframes[keyframe].number
         windows = smooth_changes(graph, moved_keyframes(outcomes), self.options, robot)
         graph.drop_oldest_pending()
@@ -487,15 +490,15 @@ class LiveMap:
         return [*outcomes, *windows.outcomes, *decided_again, *reports, *culled]
 
     def _take_optimised_poses(self, event: Optimised) -> list[Outcome]:
-        """Take the poses of an optimisation.
+        """Set the poses of the keyframes in the map to those of an optimisation.
 
-        A keyframe that arrived later moves by the same rigid motion as the optimised one before it in its
-        segment.
+        A keyframe that arrived after the optimisation began moves by the same rigid motion as the optimised
+        one before it in its segment.  Poses of keyframes that have left the map meanwhile are ignored.
         """
         graph = self._graph
         T_optimised = np.frombuffer(event.T_map_camera, dtype="<f8").reshape(-1, 4, 4)
         index_of = {i: index for index, i in enumerate(event.ids) if graph.exists(i) and self.is_in_map(i)}
-        # 1. Take the optimised poses; a keyframe that arrived later moves as the optimised one before it.
+        # 1. Set the optimised poses; move each later keyframe as the optimised one before it.
         motions: dict[int, Array] = {}
         for row, segment in enumerate(graph.segments):
             if not segment.keyframes or not graph.is_aligned(row):
@@ -539,7 +542,7 @@ class LiveMap:
         return ends
 
     def _forget_robot(self, robot: str) -> list[Outcome]:
-        """Take out all that a robot contributed, and decide again about what rested on it."""
+        """Take out all that a robot contributed, and decide again about the loop closures of other robots."""
         graph = self._graph
         forgotten = graph.forget_robot(robot)
         self._snapshot_writer.forget(forgotten)

@@ -43,10 +43,11 @@ __all__ = [
 ASSUMED_MEDIAN_DEPTH_M = 2.0
 """Metres: median depth that a keyframe without metric scale is assumed to have, as in a room."""
 MIN_WRONG_LOG_SCALE = 0.04
-"""Absolute natural logarithm of the ratio of two robots' depths from which on one metric scale is wrong; the
-depths of the three robots of the 7-Scenes red kitchen recordings differ by 1 to 2 %."""
+"""Absolute natural logarithm of the ratio of two robots' depths from which on one metric scale counts as
+wrong, if it is also above `MIN_WRONG_SCALE_DEVIATIONS`; the depths of the three robots of the 7-Scenes red
+kitchen recordings differ by 1 to 2 %."""
 MIN_WRONG_SCALE_DEVIATIONS = 2.0
-"""Standard deviations of the measured ratio of depths from which on one metric scale is wrong."""
+"""Standard deviations of the measured logarithm from which on one metric scale counts as wrong."""
 
 LOOP_CLOSURE_EVIDENCE = RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.3, min_matches=15)
 """Evidence that the measured relative pose of two keyframes needs to become a pending loop closure.  It is
@@ -121,7 +122,7 @@ def measure_stored_keyframes(
 
 
 def merge_measurements(keyframe: int, parts: Iterable[LoopClosuresMeasured]) -> LoopClosuresMeasured:
-    """Return the loop closures and failures of several measurements of *keyframe* as one event, in order."""
+    """Return one event with the loop closures, in order, and the failures of all *parts* of *keyframe*."""
     loop_closures: list[MeasuredLoopClosure] = []
     failed: Counter[str] = Counter()
     for part in parts:

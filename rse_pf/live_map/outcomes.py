@@ -42,7 +42,7 @@ class Joined:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Corrected:
-    """The alignment of a robot's segment with the map changed, or the segment has one for the first time.
+    """The alignment of a robot's segment with the map changed, or the segment has one now, or again.
 
     ``T_map_odom`` ``(4, 4)`` maps from the odometry frame of the segment to the frame of the map.
     ``covariance`` ``(6, 6)`` is that of its left twist (metres, radians).  ``cause`` is the keyframe (robot,

@@ -59,8 +59,10 @@ __all__ = [
 MAX_SQUARED_MISFIT = 30.0
 """Squared Mahalanobis norm of a loop closure's residual above which it counts as a misfit.  By the chi-square
 distribution with six degrees of freedom, one true loop closure in 25,000 is above."""
-MAX_MISFITS = 8  # updates in a row in which a loop closure misfits the smoothed graph until it is rejected
-MAX_EDGES_AFTER_JOIN = 48  # newest pending loop closures that are classified after a join, to bound CPU time
+MAX_MISFITS = 8  # smoothings in a row that an accepted loop closure misfits before it is rejected
+MAX_EDGES_AFTER_JOIN = 48
+"""Newest pending loop closures within a joined component that are decided after the join; older ones stay
+pending without a decision, which bounds CPU time."""
 MAX_ALIAS_RADIUS_M = 5.0
 """Largest radius, in metres, around a place that looks like another one, within which all keyframes are taken
 for perceptual aliases."""
@@ -71,7 +73,9 @@ strongest path between both segments; else that connection is rejected."""
 JUMP_NEIGHBOURS = 4
 """Keyframes before a new one that may prove a jump of its odometry: they saw the same place a moment before,
 so they cannot be at another place that looks the same."""
-MAX_JUMP_RATIO = 0.5  # error of odometry per length of motion above which the odometry has jumped
+MAX_JUMP_RATIO = 0.5
+"""Error of odometry per length of motion above which the odometry has jumped, if the error is also above
+`ALIAS_DISTANCE_M`."""
 CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 records of contradictions decide about a robot
 MAX_CONTRADICTIONS = 16
 """Contradictions among the last 32 records of a segment from which on it is excluded; honest robots stay far
@@ -130,10 +134,11 @@ def decide_edges(graph: MapGraph, keyframe: int, numbers: Sequence[int]) -> Iter
 
 
 def decide_misfits(graph: MapGraph, squared_misfits: Mapping[int, float]) -> Iterator[Decision]:
-    """Count the misfits of accepted loop closures, and reject those with eight in a row.
+    """Count in how many smoothings in a row each loop closure misfitted, and reject it at the eighth.
 
-    *squared_misfits* has the squared Mahalanobis norm of the residual of each smoothed loop closure, by
-    number.
+    *squared_misfits* has the squared Mahalanobis norm of the residual of each accepted loop closure of the
+    smoothing that ended now, by number.  A norm above `MAX_SQUARED_MISFIT` is a misfit; an edge of a stored
+    version never counts as one.
     """
     misfits = {}
     for number, square in squared_misfits.items():
@@ -149,9 +154,14 @@ def decide_misfits(graph: MapGraph, squared_misfits: Mapping[int, float]) -> Ite
 
 
 def _decide_within(graph: MapGraph, numbers: list[int]) -> Iterator[Decision]:
-    """Accept loop closures within one component that agree with the graph; use the others as evidence.
+    """Accept, or leave pending, the loop closures *numbers* within one component, by the poses of the graph.
 
-    Others without enough support, and weak ones that repeat an accepted one of full weight, stay pending.
+    1. Those that agree with the graph are accepted, except weak ones (below full weight) that repeat an
+       accepted one of full weight.
+    2. A vague one is accepted if enough pending loop closures support it, together with these.
+    3. A contrary one with enough support rejects accepted loop closures that it and its support outweigh.
+
+    All others stay pending.
     """
     # 1. Compare the loop closures with the poses of the graph.
     fits = classify_by_graph(graph, numbers)
@@ -166,13 +176,14 @@ def _decide_within(graph: MapGraph, numbers: list[int]) -> Iterator[Decision]:
     for number in agreeing:
         if number not in full and not _has_full_weight_parallel(graph, number):
             yield AcceptEdges(numbers=[number])
-    # 3. Compare the other loop closures with pending ones: with enough support vague ones are accepted, and
-    #    contrary ones reject accepted ones.
+    # 3. Compare the vague and the contrary loop closures with pending ones.  With enough support, vague ones
+    #    are accepted, and contrary ones reject accepted loop closures that they outweigh.
     for number, fit in fits.items():
         if fit == "agrees" or not graph.is_pending(number):
             continue
         edge = graph.edges[number]
-        # A rejection for an earlier loop closure of this loop may have separated the components of both ends.
+        # Skip a loop closure whose ends are in two components now, because a decision about an earlier one of
+        # *numbers* has rejected what connected them; it stays pending.
         if graph.components[edge.a] != graph.components[edge.b]:
             continue
         supporting = find_supporting_edges(graph, number)
@@ -310,9 +321,11 @@ def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tupl
 
 
 def _decide_join(graph: MapGraph, first: int, second: int) -> Iterator[Decision]:
-    """Join two components if enough pending loop closures between them agree, and decide about the rest.
+    """Join the components *first* and *second* if enough pending loop closures between them agree.
 
-    If too few agree, nothing changes.  If they agree but are ambiguous, only the reasons of segments change.
+    After a join, the newest 48 pending loop closures within the joined component are decided.  If too few
+    agree, nothing changes.  If loop closures agree on several different joins, only the reason why segments
+    have no alignment changes.
     """
     decision = decide_join(graph, first, second)
     if decision is not None:
@@ -339,7 +352,8 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float) -> Ite
         distances_m = np.sqrt(((positions - positions[i]) ** 2).sum(axis=1))
         near = np.flatnonzero((distances_m < radius_m) & (components == components[i]))
         yield MarkAliases(keyframes=near.tolist())
-    # 2. Reject connections between segments whose weight, without loop closures at aliases, is too small.
+    # 2. Reject each connection (all accepted loop closures between two segments) that weighs less than 3
+    #    without its loop closures at aliases.
     for pair, connection in sorted(graph.accepted_edges_by_segments().items()):
         is_fixed = any(graph.edges[number].is_fixed for number in connection)
         distinct = [number for number in connection if not _is_at_alias(graph, number)]

@@ -6,9 +6,9 @@
 2. Loop closures *between two components* are compared pairwise; the largest set that agrees joins both
    components (`decide_join`), unless perceptual aliases may explain it.
 
-All functions only read the graph, except that it keeps the result of each tested pair
-(`MapGraph.note_pair_consistency`).  They take loop closures as values in one direction and one unit of
-length, and call the tests of `rse_pf.slam.consistency`.
+All functions only read the graph, except that `decide_join` stores in it whether each tested pair of loop
+closures agrees (`MapGraph.note_pair_consistency`).  For the tests of `rse_pf.slam.consistency`, loop closures
+are converted to one direction and one unit of length (`DirectedEdge`).
 
 Source:
     Mangelson et al., Pairwise consistent measurement set maximization for robust multi-robot map merging,
@@ -58,14 +58,21 @@ __all__ = [
 ]
 
 MIN_SUPPORT = 3.0
-"""Summed weight of loop closures that agree pairwise, at least, before they join components or reject others.
-With this value, 0 of 2,000 random wrong loop closures were accepted (``benchmarks live.one_process``)."""
+"""Summed weight of loop closures that agree pairwise, at least, before they join components or reject others;
+with less, they stay pending.  With this value, 0 of 2,000 random wrong loop closures were accepted
+(``benchmarks live.one_process``)."""
 MIN_SUPPORTING_KEYFRAMES = 2
 """Different keyframes on each side, at least, that loop closures must connect before they join components or
 reject others, because loop closures of one keyframe share its errors."""
-MAX_TESTED_EDGES = 48  # newest loop closures between two components that are tested, to bound CPU time
-MAX_EDGES_OF_KEYFRAME = 4  # tested loop closures that share a keyframe, at most; more repeat its evidence
-MAX_CONTRARY_EDGES = 24  # newest loop closures that are tested against one by odometry, to bound CPU time
+MAX_TESTED_EDGES = 48
+"""Newest pending loop closures between two components that are tested pairwise before a join; older ones stay
+pending untested, which bounds CPU time."""
+MAX_EDGES_OF_KEYFRAME = 4
+"""Most loop closures that share a keyframe among those that are tested; those with fewer inliers are not
+tested, since they repeat the evidence of the keyframe."""
+MAX_CONTRARY_EDGES = 24
+"""Newest other loop closures between the same two segments that are tested by odometry against one loop
+closure; older ones do not support it, which bounds CPU time."""
 MAX_CONFIRMED_STEPS = 12.0
 """Steps of odometry between both ends of a loop closure beyond which drift makes the graph too vague to
 confirm a single loop closure."""
@@ -73,7 +80,9 @@ MAX_PATH_STEPS = 200.0
 """Steps of odometry of a path along which drift leaves no information on the relative pose.  A path that the
 search does not find counts as at most so many steps within one segment, where odometry connects both ends,
 and as at least so many steps elsewhere."""
-MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
+MAX_VISITED_KEYFRAMES = 250
+"""Most keyframes that one search for shortest paths visits, to bound CPU time; the length of a path that is
+not found within them is estimated."""
 MAX_DRIFT_RATIO = 0.15
 """Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures
 means that two places look the same."""
@@ -109,7 +118,7 @@ class DirectedEdge(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contradiction:
-    """What a loop closure that is contrary to the graph says.
+    """What a loop closure proves that is contrary to the graph: a perceptual alias, or wrong loop closures.
 
     ``alias_distance_m`` is the distance of two places that look the same, None if drift explains the error.
     ``edges`` are the numbers of the accepted loop closures of the same segment that contradict the contrary
@@ -137,7 +146,7 @@ def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
     if total_weight(graph, numbers) < MIN_SUPPORT:
         return False
     first = graph.edges[numbers[0]]
-    # 1. Tell the sides apart by the segments of the ends within one component, else by their components.
+    # 1. Distinguish the sides by the segments of the ends within one component, else by their components.
     is_within_component = graph.components[first.a] == graph.components[first.b]
     side_of = graph.segment_rows if is_within_component else graph.components
     # 2. Collect the different keyframes of each side.
@@ -218,9 +227,11 @@ def find_supporting_edges(graph: MapGraph, number: int) -> list[int]:
 
 
 def has_consistent_scale(graph: MapGraph, edge: LoopEdge, steps: float = 0.0) -> bool:
-    """Return whether the measured scale of a loop closure is that of the graph, if the graph knows the scale.
+    """Return whether the measured scale of a loop closure fits that of the graph.
 
-    *steps* of odometry lie between both ends; the scale of a single camera drifts along them.
+    The result is true if no scale was measured, because both segments are metric, or if the graph does not
+    know the ratio of both scales yet.  *steps* of odometry lie between both ends; the scale of a single
+    camera drifts along them.
     """
     if edge.scale is None:
         return True
@@ -276,12 +287,13 @@ def _agree_by_odometry(
 
 
 def find_contradiction(graph: MapGraph, number: int) -> Contradiction | None:
-    """Return whether loop closure *number*, contrary to the graph, proves aliases or contradicts others.
+    """Return what loop closure *number*, which is contrary to the graph, proves; None if it proves nothing.
 
     The error of the relative pose of both ends is computed by odometry within one segment, and by the poses
     of the graph between two segments of one component.  An error above 1 m and above 15 % of the path along
-    odometry proves perceptual aliases; a smaller one within a segment may be that of accepted loop closures.
-    Return None if *number* is between two segments and an end is a known perceptual alias: it proves nothing.
+    odometry proves perceptual aliases.  A smaller one within a segment contradicts accepted loop closures
+    that do not agree with *number* by odometry.  A loop closure between two segments proves nothing if an end
+    is a known perceptual alias.
     """
     # 1. Compute the error of the relative pose, and the steps of odometry between both ends.
     rows, edge = graph.segment_rows, graph.edges[number]
@@ -434,7 +446,7 @@ def decide_join(graph: MapGraph, first: int, second: int) -> JoinComponents | St
     consistent = _find_consistent_edges(graph, first, second)
     if not has_enough_support(graph, consistent):
         return None
-    # 2. Refuse a set that perceptual aliases may explain.
+    # 2. If perceptual aliases may explain the set, return this reason instead of a join.
     root = graph.root_component()
     reason = _find_ambiguity(graph, first, second, consistent)
     if reason:
@@ -528,7 +540,7 @@ def _thin_out(graph: MapGraph, numbers: list[int], component: int, min_distance_
 
 def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[int]) -> str:
     """Return why a consistent set may see one of several equal places, empty if there is no sign of that."""
-    # 1. Loop closures at known perceptual aliases prove nothing.
+    # 1. The set is ambiguous if it has too little support without loop closures at known perceptual aliases.
     ends = {number: {graph.edges[number].a, graph.edges[number].b} for number in consistent}
     distinct = [number for number in consistent if ends[number].isdisjoint(graph.aliased_keyframes)]
     if not has_enough_support(graph, distinct):
@@ -539,8 +551,8 @@ def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[i
     metric = {first, second} & graph.metric_components
     if size_m and min((_extent_m(graph, distinct, side) for side in metric), default=0.0) <= size_m:
         return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
-    # 3. A second consistent set without the loop closures of the first one must give the same pose within
-    #    1 m, if it has at least half of the weight.
+    # 3. The set is ambiguous if a second consistent set, without its loop closures, has enough support and at
+    #    least half of its weight, but gives a relative pose of both components that differs by more than 1 m.
     rivals = _find_consistent_edges(graph, first, second, frozenset(consistent))
     is_heavy = total_weight(graph, rivals) / RIVAL_WEIGHT >= total_weight(graph, consistent)
     if is_heavy and has_enough_support(graph, rivals):

@@ -92,7 +92,7 @@ class SmoothedWindows:
 def smooth_changes(
     graph: MapGraph, moved: list[int], options: LiveMapOptions, robot: str | None = None
 ) -> SmoothedWindows:
-    """Smooth around changed loop closures, and reject those that misfit for long.
+    """Smooth around changed loop closures, and reject those that misfit eight smoothings in a row.
 
     The outcomes of the result have a request to optimise the whole graph if the border of the largest window
     moved too far, and at least 20 keyframes arrived since the last such request.
@@ -108,7 +108,8 @@ def smooth_changes(
     debt = graph.smoothing_debt.get(robot, 0) if robot is not None else 0
     if debt >= options.max_smoothing_debt:
         options = replace(options, window_sizes=options.window_sizes[:1])
-    # 2. Smooth; reject loop closures that misfit the result for long; smooth again without them.
+    # 2. Smooth, and reject loop closures that misfit eight smoothings in a row; if there are any, smooth
+    #    again.
     windows = smooth_around(graph, moved, graph.anchors(), options) if moved else SmoothedWindows()
     keyframe_count = windows.keyframe_count
     rejected = graph.apply(decide_misfits(graph, windows.squared_misfits))
@@ -120,7 +121,8 @@ def smooth_changes(
     allowance = options.smoothing_allowance
     if robot is not None and (debt or keyframe_count > allowance):
         graph.set_smoothing_debt(robot, max(0, debt + keyframe_count - allowance))
-    # 4. Request an optimisation of the whole graph if no window was large enough.
+    # 4. Request an optimisation of the whole graph if no window was large enough, unless the last request was
+    #    made less than 20 keyframes ago.
     is_due = len(graph) - graph.optimised_at >= MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS
     if windows.is_strained and is_due and graph.root >= 0:
         graph.note_optimisation()
@@ -129,7 +131,7 @@ def smooth_changes(
 
 
 def moved_keyframes(outcomes: Iterable[Outcome], before: Iterable[int] = ()) -> list[int]:
-    """Return the keyframes *before*, and after them the other ends of accepted and rejected loop closures."""
+    """Return the keyframes *before*, followed by the other ends of the loop closures in *outcomes*."""
     moved = list(before)
     for outcome in outcomes:
         if isinstance(outcome, LoopClosureAccepted | LoopClosureRejected):
@@ -172,7 +174,7 @@ def smooth_around(
             wanted = [i for i in newest if i in inside]
             result.keyframe_count += len(ids)
             smoothed, border, row_of = _smooth_window(graph, ids, wanted, edges, free_scales)
-            # 4. Take the result if the border hardly moved, or there is no larger window.
+            # 4. Take the result if the border hardly moved, or there is no larger window; else try that one.
             is_strained = not is_whole and _has_moved(graph, border, smoothed, row_of, options)
             if is_strained and size != options.window_sizes[-1]:
                 continue

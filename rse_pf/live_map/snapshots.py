@@ -260,7 +260,7 @@ def _unpack_segments(packed: _Packed) -> list[Segment]:
                 is_from_version=is_from_version,
             )
         )
-    # Snapshots of earlier releases do not have the contradictions of segments.
+    # Snapshots of earlier releases do not have the contradictions: these segments begin without any.
     for segment, (contradictions, is_excluded) in zip(segments, packed.trust, strict=False):
         segment.contradictions, segment.is_excluded = contradictions, is_excluded
     return segments

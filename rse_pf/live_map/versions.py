@@ -37,7 +37,7 @@ __all__ = [
 MAX_IMAGE_REFERENCES = 8_000
 """Newest keyframes of a version whose images are listed in its provenance: a reference needs 75 bytes, and
 the registry of maps refuses a provenance above 1 MiB."""
-MAX_ROBOT_NAME = 64  # characters of a robot's name in a version
+MAX_ROBOT_NAME = 64  # characters of a robot's name in a version; a longer name is cut at its end
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,9 +162,10 @@ def version_of(graph: MapGraph) -> MapVersion:
 
 
 def point_sources(graph: MapGraph, version: MapVersion) -> tuple[PointSource, ...]:
-    """Return the stored point clouds of the keyframes of *version*, which was just made of *graph*.
+    """Return where the point clouds of the keyframes of *version*, which was just made of *graph*, are
+    stored.
 
-    Points of segments that are excluded or not metric are left out.
+    Point clouds of segments that are excluded or not metric are left out.
     """
     sources = []
     for keyframe in version.keyframes:
@@ -266,7 +267,7 @@ def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
 
 
 def _kind_of(graph: MapGraph, edge: LoopEdge) -> EdgeKind:
-    if edge.is_fixed:  # Neither the log nor the graph holds the kind of the edges of a stored version.
+    if edge.is_fixed:  # The graph does not hold the kind that the edge has in the stored version.
         return "odometry"
     return "merge" if graph.segment_rows[edge.a] != graph.segment_rows[edge.b] else "loop"
 

@@ -30,7 +30,7 @@ _POINT_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm, below the noi
 _PIXEL_DECIMALS = 2  # decimals of a pixel coordinate: 0.01 px, below the noise of features
 _DEPTH_DECIMALS = 3  # decimals of a depth in metres: 1 mm, as depth cameras write
 _WEAK_LIMITS = WeakLimits()  # limits beyond which a pose of the fast path is weak: those of `solve_pnp`
-MAX_CORRESPONDENCES = 5000  # most correspondences of a command: more take time and do not improve the pose
+MAX_CORRESPONDENCES = 5000  # most correspondences of a command: more are refused, as they improve no pose
 
 
 class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):

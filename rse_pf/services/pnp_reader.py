@@ -1,8 +1,8 @@
 """A fast decoder of ``pnp`` commands, which makes no Python object of each number.
 
-The decoder accepts the messages that our SDKs send: known fields, and arrays of short decimal numbers or of
-raw bytes. For any other message it returns None; the codec then decodes the message, as that of any service,
-or reports the error.
+The decoder accepts the messages that our SDKs send: known fields only, with arrays as lists of decimal
+numbers of at most 15 digits (JSON) or as raw bytes (MessagePack). For any other message it returns None; the
+codec then decodes the message, as that of any service, or reports the error.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ __all__ = ["pnp_reader"]
 Value = TypeVar("Value")
 
 _HEAD_BYTES = 128
-"""Bytes at the start of a message in which the name ``pnp`` must stand: our SDKs write it before the
-payload."""
+"""Bytes at the start of a message in which the name ``pnp`` is searched: our SDKs write it before the
+payload.  A message without the name there is left to the codec."""
 _UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, IndexError, RsePfError)
-"""Errors after which the message is left to the codec, which decodes it or reports the error."""
+"""Errors of this decoder after which it returns None, so that the codec decodes the message or reports the
+error."""
 
 
 class _Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -130,7 +131,7 @@ def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], 
             depths = request.depths_m
             depths_m = lists[ord(depths)] if isinstance(depths, str) else depths
             if len(lists) != 2 + isinstance(depths, str):
-                return None  # A list of numbers stands in another field.
+                return None  # A field other than points_world, pixels and depths_m holds a list of numbers.
             return _make_command(command, points_world, pixels, depths_m)
         except _UNREADABLE:
             return None
@@ -143,7 +144,8 @@ def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], 
             request = command.payload
             depths_m = request.depths_m
             if depths_m:
-                # The hook refuses numbers that are not finite; for points and pixels the solver does.
+                # Only the depths of a MessagePack command pass `decode_hook`, which raises an error if one is
+                # not finite; the solver refuses such points and pixels later.
                 depths_m = decode_hook(np.ndarray, _decode_array(depths_m))
             points_world, pixels = _decode_array(request.points_world), _decode_array(request.pixels)
             return _make_command(command, points_world, pixels, depths_m)

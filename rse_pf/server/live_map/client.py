@@ -34,7 +34,8 @@ __all__ = ["LiveMapClient"]
 _STORE_THREADS = 4
 """Number of threads in which a worker reads leases of live maps: as many leases are read at the same time."""
 _RELEASE_TIMEOUT_S = 5.0
-"""Seconds for which a worker that ends waits until its map servers have released their maps."""
+"""Seconds for which a worker that ends waits until its map servers have released their maps; after that time
+it ends all the same, and Linux kills them."""
 _LISTED_STATES = {"serving": "live", "starting": "moving", "released": "idle", "stopped": "stopped"}
 """State of a map in the reply of ``live-list``, for each state of its lease: ``live`` while a map server
 answers requests, ``moving`` while a map server restores the map, ``idle`` without a map server, ``stopped``

@@ -81,7 +81,7 @@ def internal_key(store: ObjectStore) -> bytes:
         key = secrets.token_bytes(_KEY_BYTES)
         try:
             store.compare_and_swap(INTERNAL_KEY, None, key)
-        except Conflict:  # another server has stored a key meanwhile, which all servers use
+        except Conflict:  # another server has stored a key meanwhile: use that one
             key = store.get(INTERNAL_KEY)
     if len(key) != _KEY_BYTES:
         raise StoreError(
@@ -159,7 +159,8 @@ def client_context() -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = _TLS_VERSION
     context.check_hostname = False
-    # The certificate is self-signed and pinned by check_certificate: only the map server has its private key.
+    # OpenSSL verifies no certificate: that of a map server is self-signed, and check_certificate compares it
+    # with the SHA-256 in the lease.
     context.verify_mode = ssl.CERT_NONE
     return context
 

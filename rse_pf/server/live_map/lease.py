@@ -270,11 +270,11 @@ class MapLease:
         Raises:
             StoreError: The store fails, so that the outcome is unknown.
         """
+        # `Lease.write` fails if the stored record is not the known one, and reads it.  If it has the name of
+        # this process, an earlier write has succeeded although its reply was lost: replace it.
         while not self._lease.write(record):
             if not self._is_held:
                 return False
-            # The stored record has the name of this process, so an earlier write has succeeded although its
-            # reply was lost.  `Lease.write` has read that record: the next round of this loop replaces it.
         self.record = record
         return True
 

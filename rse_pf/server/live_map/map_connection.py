@@ -56,7 +56,8 @@ __all__ = ["ConnectionContext", "MapConnection", "can_begin_map"]
 
 _READ_BYTES = 1 << 18  # largest number of bytes that one read of a socket returns
 _CONNECT_TIMEOUT_S = 1.0
-"""Seconds within which a map server must accept a connection, and then as many to answer the hello."""
+"""Seconds within which a map server must accept a connection, and then as many to answer the hello; else the
+connection counts as failed, and the worker reads the lease again."""
 _POLL_S = 0.1
 """Seconds between two reads of the lease while the map has no connected map server but needs one, while the
 store fails, or while the connected map server has not renewed its lease for `_PREPARE_SHARE` of it."""
@@ -279,7 +280,8 @@ class MapConnection:
             await self._pause(_IDLE_POLL_S)
         elif action == "claim":
             await self._claim_map()
-        # 4. Use a map server that accepts connections until its connection or its lease ends.
+        # 4. Use a map server that accepts connections until its connection or its lease ends; if it cannot be
+        # reached, start a spare process and wait.
         elif action == "connect" and record is not None:
             if await self._use_map_server(record):
                 await asyncio.sleep(_RECONNECT_S)

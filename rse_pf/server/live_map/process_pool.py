@@ -281,7 +281,7 @@ class MapServerPool:
         """
         now = self._clock()
         in_use_by_tenant = Counter(process.tenant for process in self._in_use)
-        # 1. Give a map that is only watched none while a map that gets commands may ask again.
+        # 1. Refuse a map that is only watched while a map that gets commands may still ask for a process.
         if is_watched_only and now < self._wanted_until_s:
             return None
         # 2. Leave one process free if it is reserved for a tenant that holds fewer processes than *tenant*.
@@ -295,7 +295,7 @@ class MapServerPool:
             return None
         if tenant == self._reserved_for:
             self._reserved_until_s = float("-inf")
-        # 4. Assign the spare to the map, and start the next spare 3 s later.
+        # 4. Assign the spare, which is started now if there is none, and start the next spare 3 s later.
         self.prepare_spare()
         process, self._spare = self._spare, None
         if process is not None:

@@ -63,7 +63,8 @@ _MAX_WAITING_BYTES = 64 << 20
 are refused with Busy, and robots keep their keyframes."""
 _MAX_WAITING_BYTES_PER_TENANT = _MAX_WAITING_BYTES // 4
 """Largest total size in bytes of the messages of one tenant that wait for map servers in one worker: a
-quarter of the total, so that one tenant cannot fill it."""
+quarter of the total, so that one tenant cannot fill it.  Beyond it, commands of this tenant are refused with
+Busy."""
 _BUSY_RETRY_MS = 500.0
 """Milliseconds after which a robot sends a command again that was refused because too many wait."""
 

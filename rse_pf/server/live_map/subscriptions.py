@@ -35,8 +35,8 @@ _MAX_SENT_PER_ROUND = 200
 """Largest number of updates that are sent in one round.  An update takes about 20 us, and commands of robots
 wait until the round has ended."""
 _MAX_KEYS = 1024
-"""Largest number of keys of one map whose newest update is stored; the key whose update is oldest is dropped
-first."""
+"""Largest number of keys of one map whose newest update is stored; beyond it, the oldest update is dropped,
+and is not sent to subscribers that have not received it."""
 _MAX_UPDATE_BYTES = 65_536
 """Largest encoded payload of an update in bytes; a larger one is logged and not sent."""
 _UPDATE_WITHOUT_MAP_SERVER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
@@ -64,7 +64,7 @@ class _WatchedMap:
         default_factory=dict
     )  # the newest update of each key, the oldest first
     subscriptions: dict[_Subscription, None] = field(default_factory=dict)
-    starters: set[_Subscription] = field(default_factory=set)  # subscriptions that may start a map server
+    starters: set[_Subscription] = field(default_factory=set)  # those for which a map server may be started
     may_start: bool | None = None  # whether `watch` was last called with True or False; None: not called yet
 
 

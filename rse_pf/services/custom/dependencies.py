@@ -72,7 +72,7 @@ _REMOVED_VARIABLES = {
 """Environment variables that pip does not get, since they would change which files are installed, or
 where."""
 _MAX_REASON = 300
-"""Largest number of characters of pip's reason that an error quotes."""
+"""Largest number of characters of pip's reason that an error quotes; the rest is cut off."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -313,7 +313,7 @@ def _install(requirements: Sequence[LockedRequirement], folder: Path, store: Pat
             str(lock.absolute()),
             hint=f"only wheels with the hashes of the lock are installed: rse-pf service lock {folder}",
         )
-        shutil.rmtree(fresh / "bin", ignore_errors=True)  # Sandboxes cannot start programs.
+        shutil.rmtree(fresh / "bin", ignore_errors=True)  # Scripts, since sandboxes cannot start programs.
         digest = tree_digest(fresh)
         _publish_folder(fresh, store / digest)
     finally:

@@ -14,7 +14,7 @@ from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["MAX_LINE", "OutputLines", "format_output_line"]
 
-MAX_LINE = 256  # longest line of output in characters: the length that a line of the log holds
+MAX_LINE = 256  # longest line of output in characters, as long as a line of the log; a longer one is cut
 _MARK_CHARACTERS = 40  # characters of a cut line that are reserved for the mark "[N characters more]"
 _LINES_PER_S = 50.0  # lines per second that pass in the long run, so that one service cannot fill the log
 _BURST_LINES = 200.0  # lines that pass at once, such as a traceback, after a time without output

@@ -77,7 +77,7 @@ class PrivateFolder:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(path, ignore_errors=True)
             except BlockingIOError:
-                pass  # Its process is running.
+                pass  # The process that made the folder still runs: the folder stays.
             finally:
                 os.close(lock)
 

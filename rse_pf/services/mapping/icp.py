@@ -14,11 +14,13 @@ from rse_pf.wire.arrays import Array, reshaped
 __all__ = ["IcpReply", "IcpRequest", "register"]
 
 MAX_POINTS = 1_000_000
-"""Most points of one cloud of a request, which bounds the time and memory of an alignment."""
+"""Most points of one cloud of a request, which bounds the time and memory of an alignment; a request with a
+larger cloud is refused with LimitExceeded."""
 _MAX_VOXELS = 500_000
-"""Largest distance of a point from the origin along an axis, in voxels.  The voxel indices of small_gicp have
-21 bits for each axis, and so reach 2^20 (1,048,576) voxels to either side; about half of them is a margin for
-the motion of the source cloud."""
+"""Largest distance of a point, or of the initial position, from the origin along an axis, in voxels; a
+request beyond it is refused with BadRequest.  The voxel indices of small_gicp have 21 bits for each axis, and
+so reach 2^20 (1,048,576) voxels to either side; about half of them is a margin for the motion of the source
+cloud."""
 
 
 class IcpRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,8 +46,9 @@ class IcpReply(msgspec.Struct, frozen=True, kw_only=True):
         T_target_source: 16 numbers, row-major: the refined pose; the guess of the request where it is
             refused.
         verdict: ``ok`` or ``refused``.
-        reason: Why the refined pose is refused: worse, poor-fit, little-overlap, sliding, jumped or
-            not-converged.
+        reason: Why the refined pose is refused, empty if it is not: ``worse`` (it fits worse than the guess),
+            ``poor-fit`` (the surfaces do not fit), ``little-overlap``, ``sliding`` (the surfaces do not
+            constrain the pose), ``jumped`` (it is too far from the guess) or ``not-converged``.
         overlap: Share of the source points with a correspondence at the refined pose, 0..1.
         misfit_before_m: Mean distance of source points to the target's surface at the guess, metres.
         misfit_after_m: Mean distance of source points to the target's surface at the refined pose, metres.

@@ -28,10 +28,11 @@ __all__ = [
 
 
 MAX_MAPS = 64
-"""Most maps that one request merges; all maps together have at most 2,000 keyframes."""
+"""Most maps of one request, which is refused with more; all maps together have at most 2,000 keyframes."""
 _MAX_PROJECTIONS = 20_000_000_000
-"""Largest product of the numbers of keyframes and of cloud points of all maps of a request: to project so
-many points takes an hour, the default time limit of a job (``max_job_s``)."""
+"""Largest product of the numbers of keyframes and of cloud points of all maps of a request, which is refused
+with LimitExceeded beyond it: to project so many points takes an hour, the default time limit of a job
+(``max_job_s``)."""
 
 
 class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,8 +78,8 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
         refused: Rejected loop closures.
         loops: Number of accepted loop closures within a map, summed over the joined maps.
         merges: Number of accepted loop closures between two joined maps.
-        cost_before: Cost of the pose graph before the optimisation.
-        cost_after: Cost of the pose graph after the optimisation.
+        cost_before: Cost of the merged pose graph, with the robust loss, before its optimisation; no unit.
+        cost_after: The same cost after the optimisation, at most *cost_before*.
     """
 
     map: bytes

@@ -15,7 +15,8 @@ from rse_pf.slam.pose_graph import read_g2o, write_g2o
 __all__ = ["OptimiseReply", "OptimiseRequest", "register"]
 
 MAX_EDGES = 100_000
-"""Most edges of the pose graph of a request, which bounds the time and memory of the job."""
+"""Most edges of the pose graph of a request, which bounds the time and memory of the job; a larger graph is
+refused with LimitExceeded."""
 
 
 class OptimiseRequest(msgspec.Struct, frozen=True, kw_only=True):

@@ -49,17 +49,20 @@ __all__ = [
 _CACHED_MAPS = 2
 """Number of decoded maps with their indexes that a process keeps between requests: those used last."""
 MAX_KEYFRAMES = 2000
-"""Most keyframes of all maps of one request together, which bounds its time and memory."""
+"""Most keyframes of all maps of one request together, which bounds its time and memory; a request with more
+is refused with LimitExceeded."""
 MAX_FEATURES = 2_000_000
-"""Most features of all keyframes of one map together, which bounds the memory of a request."""
+"""Most features of all keyframes of one map together, which bounds the memory of a request; a request with a
+larger map is refused with LimitExceeded."""
 MAP_LIMITS = MapLimits(keyframes=MAX_KEYFRAMES, features=MAX_FEATURES)
-"""Limits of a map that a service decodes."""
+"""Limits of each map of a request; a larger map is refused."""
 MAX_VIEW_FEATURES = 20_000
-"""Most features of the view (the image to localise) of a request, which bounds the time of matching."""
+"""Most features of the view (the image to localise) of a request, which bounds the time of matching; a
+request with more is refused with LimitExceeded."""
 _MAX_COMPARISONS = 2_000_000_000
-"""Most comparisons of two ORB descriptors, one of the view and one of a candidate keyframe, in one request;
-so many take about five seconds.  A comparison of longer descriptors counts as several, in proportion to their
-size."""
+"""Most comparisons of two ORB descriptors, one of the view and one of a candidate keyframe, in one request,
+which is refused with LimitExceeded beyond it; so many take about five seconds.  A comparison of longer
+descriptors counts as several, in proportion to their size."""
 
 
 class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):
@@ -95,7 +98,7 @@ class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
         descriptors: Raw bytes of the ``n`` descriptors; 32 bytes each for ORB.
         candidates: Most keyframes of the reply, 1..100.
         check: Whether the relative pose of the view and each candidate is estimated by PnP, and the
-            candidates are sorted by the number of inliers.
+            candidates are sorted by the number of inliers; else they are sorted by their score.
         within: Prior of the camera's position; None to search the whole map.
         features: Kind of the descriptors; None for ORB.
     """

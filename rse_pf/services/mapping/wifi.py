@@ -1,8 +1,8 @@
 """The service ``wifi``: find the position of a robot by the signal strengths of Wi-Fi access points.
 
-A robot sends a scan and a survey, which is a list of scans with known positions.  No hardware address leaves
-the robot: `fingerprint_of` replaces addresses by keyed hashes, and leaves out networks whose owners opted out
-by ``_nomap``.
+Each request has a scan and a survey, which is a list of scans with known positions; the server stores
+neither.  No hardware address leaves the robot: `fingerprint_of` replaces addresses by keyed hashes, and
+leaves out networks whose owners opted out by ``_nomap``.
 """
 
 from __future__ import annotations
@@ -33,13 +33,18 @@ __all__ = [
 ]
 
 Survey = tuple[tuple[float, float, float], Mapping[str, float]]
-"""A surveyed position (metres, map frame) with the received strengths (dBm) by hashed access point."""
+"""One scan of a survey: its position (metres, map frame), and the received strengths (dBm) by hashed access
+point."""
 
 # --- What a scan may hold ---
 _OPT_OUT_SUFFIX = "_nomap"  # end of a network's name by which its owner opts out of localisation
 _MAC = re.compile(r"^(?:[0-9a-fA-F]{2}[:\-.]?){5}[0-9a-fA-F]{2}$")  # pattern of a hardware address
-_MIN_DBM = -120.0  # weakest plausible signal, dBm: below the thermal noise of a radio
-_MAX_DBM = 0.0  # strongest plausible signal, dBm: 1 mW at the antenna
+# Weakest plausible signal, dBm, below the thermal noise of a radio: `fingerprint_of` leaves out a weaker one,
+# and the service refuses it.
+_MIN_DBM = -120.0
+# Strongest plausible signal, dBm, which is 1 mW at the antenna: `fingerprint_of` leaves out a stronger one,
+# and the service refuses it.
+_MAX_DBM = 0.0
 
 # --- Calibration of the uncertainty ---
 _RADIUS_PROBABILITY = 0.68  # probability that the true position lies within sigma_m of the reply
@@ -48,26 +53,30 @@ _TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 _DEFAULT_TEMPER = 0.4  # exponent of the likelihood where a survey is too small to calibrate the exponent
 _MIN_HELD_OUT = 30  # fewest held-out positions from which the exponent is calibrated
 _FOLDS = 5  # folds of the cross-validation that calibrates the exponent
-_CALIBRATION_GRID_M = 0.5  # smallest distance of grid points in the calibration in metres, to save time
+# Smallest distance of grid points in the calibration, metres: a smaller ``grid_m`` of the request is used
+# only for the reply, which saves time.
+_CALIBRATION_GRID_M = 0.5
 
-# --- Limits of a request ---
-MAX_FINGERPRINTS = 5000  # most fingerprints (surveyed positions) of a request, which bounds its time
+# --- Limits of a request, beyond which it is refused with LimitExceeded ---
+MAX_FINGERPRINTS = 5000  # most fingerprints (surveyed positions) of a request; with more it is refused
 _MAX_FLOORS = 100  # most floors, which are surveyed heights rounded to 1 m; each floor has a grid of its own
-# Most access points with five or more readings in a survey, which bounds the time; access points with fewer
-# readings are ignored.
+# Most access points with five or more readings in a survey, which is refused with more, to bound the time;
+# access points with fewer readings are ignored.
 _MAX_ACCESS_POINTS = 300
-# Largest product of the numbers of grid points and of surveyed positions: the calibration then takes five
-# seconds.
+# Largest product of the numbers of grid points and of surveyed positions of a request, which is refused
+# beyond it: the calibration then takes five seconds.
 _MAX_POSTERIORS = 5_000_000
-# Largest product of the numbers of grid points and of readings: the predictions then take five seconds.
+# Largest product of the numbers of grid points and of readings of a request, which is refused beyond it: the
+# predictions then take five seconds.
 _MAX_PREDICTIONS = 100_000_000
+
 # Number of distances between grid points and surveyed positions that are computed at once, which bounds the
 # memory.
 _BATCH = 1_000_000
 
 
 class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
-    """An access point that a robot's radio received; its address never leaves the robot.
+    """An access point that a robot's radio received, as an argument of `fingerprint_of`; it is never sent.
 
     Attributes:
         mac: Hardware address: six bytes of hexadecimal, with or without ``:``, ``-`` or ``.`` between them.
@@ -81,7 +90,10 @@ class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
-    """A scan: strengths (dBm) by hashed access point; in a survey with its position (metres, map frame)."""
+    """A scan: received strengths (dBm, -120..0) by hashed access point.
+
+    A scan of a survey has the position (metres, map frame) at which it was taken.
+    """
 
     rssi_dbm: dict[str, float]
     position: tuple[float, float, float] | None = None
@@ -91,11 +103,12 @@ class WifiOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
     """Options of a Wi-Fi localisation.
 
     Attributes:
-        grid_m: Distance of the points of the grid over which the position is estimated, metres, 0.1..5.
+        grid_m: Distance of the points of the grid over which the position is estimated, metres, 0.1..5;
+            larger on a floor that would otherwise have more than about 40,000 grid points.
         reach_m: Largest horizontal distance of a grid point from the nearest surveyed position of its floor,
             metres, up to 50.  The robot is assumed to be at a grid point.
-        min_common: Fewest access points of the scan that the survey must know, 1..100; with fewer of them, no
-            position is found.
+        min_common: Fewest access points of the scan, 1..100, that the survey must have at five positions or
+            more; with fewer of them, no position is found.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -111,7 +124,10 @@ class WifiOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
 
 
 class WifiRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """A scan, whose position is ignored, and a survey of fingerprints with positions."""
+    """A scan whose position is wanted, and a survey of up to 5,000 fingerprints with positions.
+
+    A position in *scan* is ignored.
+    """
 
     scan: Fingerprint
     survey: list[Fingerprint]
@@ -119,20 +135,21 @@ class WifiRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WifiReply(msgspec.Struct, frozen=True, kw_only=True):
-    """The position at which a scan was taken.
+    """The estimated position at which a scan was taken, or the reason why it was not estimated.
 
     Position and radius are a prior for the field ``within`` of the services ``place`` and ``localise``; a
     radius of twice *sigma_m* is sensible.
 
     Attributes:
-        found: Whether there is a position.
-        reason: Why there is none: too few access points of the scan are known.
+        found: Whether the position was estimated; if not, all numbers are 0.
+        reason: Empty if *found*; else that the survey has too few access points of the scan.
         x: Mean of the posterior, metres, map frame.
         y: Mean of the posterior, metres, map frame.
         z: Mean of the posterior, metres, map frame.
-        sigma_m: Radius in metres of the horizontal circle around ``(x, y)`` that holds the true position with
-            a probability of 68 %; larger than the standard deviation along one axis.
-        common: Access points of the scan that the survey knows.
+        sigma_m: Radius in metres of the horizontal circle around ``(x, y)`` that holds 68 % of the posterior,
+            at least 0.3 times ``grid_m``.  The posterior is calibrated on the survey, so that the circle
+            holds the true position with this probability.  The height is not part of the radius.
+        common: Number of access points of the scan that the survey has at five positions or more.
     """
 
     found: bool
@@ -179,7 +196,7 @@ def fingerprint_of(
 
 
 class Locator:
-    """Estimates positions from scans by a survey; immutable.
+    """Estimates positions of scans by one survey, which is fitted once; immutable.
 
     The posterior over a grid around the surveyed positions has a uniform prior, and for each received access
     point a Gaussian likelihood with the mean and variance of its signal field.  The errors of access points
@@ -281,7 +298,9 @@ def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array
 def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
     """Return the power of the likelihood at which 68 % of the held-out positions lie within their radius.
 
-    The radius is horizontal.  The result is 0.4 if fewer than 30 scans know ``min_common`` access points.
+    The radius is that of `_posterior` around the position that is estimated for the held-out scan.  A scan is
+    left out if fewer than ``min_common`` of its access points have a field; of fewer than 30 other scans, the
+    result is 0.4.
     """
     # 1. Locate the scans of each fold by the readings of the other folds, with each candidate power.  Trends
     # and parameters of the fields stay those of the whole survey.
@@ -325,7 +344,7 @@ def _surveyed_position(fingerprint: Fingerprint) -> tuple[float, float, float]:
 
 
 def _check_work(survey: Sequence[Survey], options: WifiOptions) -> None:
-    """Raise LimitExceeded if *survey* has too many floors, or if a request with it would take too long."""
+    """Raise LimitExceeded if *survey* is beyond `_MAX_FLOORS`, `_MAX_POSTERIORS` or `_MAX_PREDICTIONS`."""
     if not survey:
         return
     positions = np.array([position for position, _ in survey], dtype=np.float64)
@@ -351,10 +370,10 @@ def _bounds(positions: Array, reach_m: float) -> tuple[Array, Array]:
 
 
 def _grid_pitch(low: Array, high: Array, grid_m: float) -> float:
-    """Return the distance of grid points in metres: *grid_m*, or more where a floor would have too many.
+    """Return the distance of grid points in metres: *grid_m*, or more for a large area.
 
-    The limit is about 40,000 grid points on a floor.  *low* and *high* are the ``(2,)`` corners of the area
-    of the grid, metres.
+    The distance is increased until a floor has at most about 40,000 grid points.  *low* and *high* are the
+    ``(2,)`` corners of the area of the grid, metres.
     """
     area, longest = float(np.prod(high - low)), float((high - low).max())
     return max(grid_m, math.sqrt(area / 40_000.0), longest / 40_000.0)

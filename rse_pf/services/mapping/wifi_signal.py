@@ -21,8 +21,8 @@ Rows = npt.NDArray[np.int64]
 __all__ = ["MAX_READINGS", "SignalField", "SignalModel", "fit_signals"]
 
 _MIN_READINGS = 5
-"""Fewest readings of an access point that is used, one more than the unknowns of its model without a process:
-two of its horizontal position, and two of its trend."""
+"""Fewest readings of an access point with a signal field; one with fewer readings is ignored.  The number is
+one more than the unknowns of the mean: two of the horizontal position, and two of the trend."""
 _LENGTHS_M = (2.0, 4.0, 8.0, 16.0)
 """Candidate correlation lengths of the Gaussian process, metres: from a room to a hall."""
 _SMOOTH_SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
@@ -36,8 +36,8 @@ _NEAR_M = 1.0
 _BATCH = 8192
 """Positions whose covariances with all readings are computed at once, which bounds the memory."""
 MAX_READINGS = 400
-"""Most readings of an access point in its Gaussian process, since time grows with their cube; of more, this
-number is chosen evenly in the order of the survey."""
+"""Most readings of an access point to which its trend and process are fitted, since time grows with their
+cube; of more readings, this number is chosen evenly in the order of the survey."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,7 +111,7 @@ class SignalField:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalModel:
-    """The fields of access points by their names, and all ``(n, 3)`` surveyed positions in metres."""
+    """The signal field of each access point by its name, and all ``(n, 3)`` surveyed positions in metres."""
 
     fields: Mapping[str, SignalField]
     positions: Array
@@ -120,7 +120,7 @@ class SignalModel:
 def fit_signals(
     survey: Sequence[tuple[tuple[float, float, float], Mapping[str, float]]], *, max_fields: int | None = None
 ) -> SignalModel:
-    """Fit a signal model to a survey; equal surveys give equal models.
+    """Fit the signal fields of all access points of a survey; equal surveys give equal models.
 
     Access points that were received at fewer than five positions get no field.
 

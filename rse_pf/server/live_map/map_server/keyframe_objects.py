@@ -27,14 +27,14 @@ __all__ = ["KeyframeObjects", "PointCloud"]
 
 _MAX_SOURCES = 4_000
 """Largest number of keyframes whose points are used in one point cloud, which bounds the time of a
-publication."""
+publication; of more keyframes, `_select_evenly` selects this number."""
 _MAX_POINTS = 3_000_000
 """Largest number of points of a cloud before it is thinned to one for each voxel: they take about 400 MB of
 the map server's memory.  Each of n keyframes may contribute a part of 1/n of them; of a keyframe with more
 points, every second, third, ... point is used."""
 _MAX_CACHED_BYTES = 128 << 20
 """Largest total size in bytes of the encoded points that stay in memory after a cloud was built, so that they
-need not be read from the object store again for the next version."""
+need not be read from the object store for the next version; points beyond this size are read again."""
 _MAX_DISTANCE_M = 100.0
 """Largest absolute value in metres of a coordinate of a point in the camera frame; points beyond it are left
 out, because depths this large are wrong or very inexact."""

@@ -58,8 +58,8 @@ a larger map costs more, so snapshots are written less often."""
 _SNAPSHOTS_KEPT = 2
 """Number of snapshots of a map that are kept: if the newest is damaged, a restart uses the one before."""
 _MAX_ENTRY_EVENTS = 64
-"""Largest number of events in one log entry; it bounds the time for which the thread of the map applies
-it."""
+"""Largest number of events in one log entry, which bounds the time for which the thread of the map applies
+the entry; further events are written with the next entry."""
 _MAX_ENTRY_BYTES = 4 << 20
 """Largest total size in bytes of the keyframes that share one log entry; it bounds the time of a write.  A
 larger keyframe has an entry of its own."""
@@ -240,7 +240,8 @@ class LiveLog:
         try:
             self._store.compare_and_swap(name, None, data)
         except Conflict as error:
-            # An equal entry was written by an earlier call whose reply was lost.
+            # An equal entry is that of an earlier call whose reply was lost, any other that of another
+            # process.
             if self._store.get(name) != data:
                 raise LeaseLost(f"entry {number} of the log was written by another map server") from error
         self.position = number
@@ -426,7 +427,7 @@ class LogWriter:
                 retry_after_ms=BUSY_RETRY_MS,
             )
         submitted = SubmittedEvent(event, size_bytes, asyncio.get_running_loop().create_future())
-        # asyncio logs an exception that nobody reads; a request that was cancelled does not read it.
+        # Read the exception in any case, since a cancelled request does not, and asyncio logs unread ones.
         submitted.applied.add_done_callback(lambda future: future.exception())
         self._outstanding.add(submitted.applied)
         submitted.applied.add_done_callback(self._outstanding.discard)

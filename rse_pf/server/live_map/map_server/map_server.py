@@ -222,7 +222,8 @@ class MapServer:
         # 3. Delete the stored points and images of keyframes whose features the map dropped.
         if culled:
             self.start_task(self._delete_objects_of_culled(culled))
-        # 4. Send subscribers the alignments and poses that changed.
+        # 4. Send subscribers the changed alignments of the robots' newest segments, and the pose of each
+        # keyframe that the entry added to an aligned segment; poses of earlier keyframes are not sent again.
         for update in updates:
             self._send_update(update)
         # 5. Begin to write a snapshot if enough entries were applied since the last one.
@@ -237,8 +238,9 @@ class MapServer:
         Alignments that were made or lost are written to the server's log.
 
         Returns:
-            The effects, the updates that changed and must be sent, and the objects of culled keyframes as
-            pairs of a robot's folder and a digest.
+            The effects of the entry on the map; the updates to send, which are the changed alignments and the
+            poses of added keyframes; and the stored objects of culled keyframes as pairs of a robot's folder
+            and a digest.
         """
         applied = self._state.apply(position, events)
         outcomes = [outcome for event_outcomes in applied.outcomes for outcome in event_outcomes]
@@ -258,7 +260,10 @@ class MapServer:
         return applied, updates, self._state.live_map.objects_of(culled) if culled else []
 
     async def _delete_objects_of_culled(self, culled: list[tuple[str, str]]) -> None:
-        """Delete stored points and images of culled keyframes; an error of the store is ignored."""
+        """Delete stored points and images of culled keyframes.
+
+        An error of the store is ignored: the object that was due then stays until its robot is forgotten.
+        """
         with contextlib.suppress(StoreError):
             await self._environment.threads.background(
                 functools.partial(self._environment.objects.delete_of_culled, culled)
@@ -291,8 +296,8 @@ class MapServer:
     def _complete_events(self, batch: list[SubmittedEvent], applied: AppliedEntry) -> None:
         """Complete the futures of the events of an entry, and queue the work that follows from them.
 
-        An event on which the map failed gets an InternalError.  New keyframes are queued for measurement, and
-        the whole pose graph for an optimisation if the map asks for that.
+        The future of an event on which the map failed gets an InternalError.  New keyframes are queued for
+        measurement, and the whole pose graph for an optimisation if an outcome is `OptimiseWanted`.
         """
         for submitted, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
             if defect is None:
@@ -303,7 +308,7 @@ class MapServer:
                 )
                 submitted.applied.set_exception(
                     InternalError(
-                        "the live map failed on this event, which has no effect",
+                        "the live map failed on this event, which may be applied in part",
                         hint="report the line live-map-defect of the server's log",
                     )
                 )
@@ -333,7 +338,7 @@ class MapServer:
                 await self._environment.threads.store(reserve)
             except StoreFull:
                 raise
-            except StoreError:  # the log entry waits until the store works, and is counted later
+            except StoreError:  # charge nothing: the entry waits until the store works, and is counted later
                 pass
         self._logged_bytes += size_bytes
 
@@ -402,7 +407,8 @@ class MapServer:
         if now >= self._publish_due_s:
             self._publish_due_s = now + PUBLISH_INTERVAL_S
             self._publisher.request(NOTE_CHANGED)
-        # 3. Notify the worker if commands have ceased, and give up a map that had no connections for long.
+        # 3. Notify the worker if commands have ceased, and give up a map to which no worker was connected for
+        # ``live.idle_s``.
         unused_s = _UNUSED_SHARE * environment.settings.idle_s
         if self._last_command_s is not None and now - self._last_command_s >= unused_s:
             self._last_command_s = None
@@ -453,7 +459,9 @@ class MapServer:
             # server starts fast.
             if self._state.position > self._snapshot_position:
                 await self._write_snapshot()
-            # 3. Publish a requested version without a pause, because the next map server may start late.
+            # 3. Publish a requested version without the pause of ``live.publish_pause_s``, because the next
+            #    map
+            # server may start late; wait for that at most 3 s.
             await asyncio.wait(
                 {asyncio.ensure_future(self._publisher.publish_now())}, timeout=_MAX_FINAL_PUBLICATION_S
             )

@@ -49,7 +49,8 @@ _CANDIDATES_WITH_VERY_LONG_QUEUE = 4
 _OPTIMISATION_NICE = 10
 """Niceness of the child process that optimises a whole graph: keyframes and poses have priority."""
 _MAX_OPTIMISATION_S = 120.0
-"""Seconds after which the child process that optimises a whole graph is killed."""
+"""Seconds after which the child process that optimises a whole graph is killed; the failure is logged, and
+the poses of the map stay as they are."""
 _GRAPH_FIELDS = ("T_world_pose", "a", "b", "T_a_b", "information", "robust", "ids")
 """The fields of `PoseGraph`, all of them arrays, that are sent to the child process."""
 

@@ -72,7 +72,8 @@ _SWITCH_INTERVAL_S = 0.0005
 """Seconds after which a running thread passes the interpreter lock (GIL) to a waiting one.  Python's default
 of 5 ms would delay each step of a keyframe while other threads compute."""
 _MAX_VERSION_OBJECTS = 4
-"""Largest size of a decompressed version of a map, in units of ``data.max_object_bytes``."""
+"""Largest size of a decompressed version of a map, in units of ``data.max_object_bytes``; a map server
+refuses to read a larger version, and to publish one."""
 _PROBES = {
     "0.0.0.0": (socket.AF_INET, "192.0.2.1", "127.0.0.1"),
     "::": (socket.AF_INET6, "2001:db8::1", "::1"),
@@ -198,11 +199,11 @@ class _MapServerProcess:
     async def run(self) -> None:
         self._threads.start()
         self._log.start()
-        # 1. Claim the lease.
+        # 1. Claim the lease; if another process was first, report ``lost`` and exit.
         if not await self._retry(self._threads.lease, lambda: self._lease.claim(self._order.known)):
             self._worker.sendall(encode_message(["lost"]))
             return
-        # 2. Restore the map, while the lease is renewed.
+        # 2. Restore the map, while the lease is renewed; if either fails, report ``lost`` and exit.
         renewal = asyncio.ensure_future(self._renew_until_lost())
         takeover = asyncio.ensure_future(self._take_over())
         await asyncio.wait({renewal, takeover}, return_when=asyncio.FIRST_COMPLETED)

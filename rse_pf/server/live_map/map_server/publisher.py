@@ -48,7 +48,7 @@ _QUOTA_DIVISOR = 4
 newest one stays in any case."""
 _MAX_REMOVED_AT_ONCE = 10
 """Largest number of old versions that are removed after a publication, so that the publication ends soon,
-also when the server drains."""
+also when the server drains; the next publication removes further ones."""
 _MAX_WAIT_S = 10.0
 """Longest time in seconds for which a request for a version waits until ``live.publish_pause_s`` has passed;
 a request that would wait longer is refused with Busy."""

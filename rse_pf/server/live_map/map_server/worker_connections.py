@@ -35,8 +35,9 @@ _MAX_CONCURRENT_REQUESTS = 256
 """Largest number of unanswered requests of one worker; at this number, nothing more is read from the socket
 of the worker, so that memory is bounded."""
 _FLUSH_S = 2.0
-"""Seconds for which a map server waits until its last messages are written to the sockets of workers: when
-the map is given up, and before a refused connection is closed."""
+"""Seconds for which a map server waits until its last messages are written to the sockets of workers, when
+the map is given up and before a refused connection is closed; then it goes on, although messages may be
+lost."""
 
 
 def listen(host: str, ports: range) -> socket.socket:
@@ -133,7 +134,7 @@ class WorkerConnections:
             connection.send(["refused", 0, *_error_fields(error)])
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(connection.flush(), _FLUSH_S)
-        except (OSError, asyncio.TimeoutError):  # the peer has disconnected, or is not a worker
+        except (OSError, asyncio.TimeoutError):  # disconnected, or not a worker: close without an answer
             pass
         finally:
             connection.close()
