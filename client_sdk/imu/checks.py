@@ -31,7 +31,7 @@ accelerometer explains: three standard deviations of such a bias, 0.2 m/s^2 each
 is refused."""
 
 # Limits of the samples alone, see `find_sample_trouble`
-_MIN_SAMPLES = 100  # fewer IMU samples are not checked: half a second at 200 Hz
+_MIN_SAMPLES = 100  # fewer IMU samples are not checked, and have no fault: half a second at 200 Hz
 _MAX_MISSING_FRACTION = 0.05  # largest fraction of an IMU's samples that may be missing
 _MAX_SATURATED_FRACTION = 0.01  # largest fraction of an IMU's samples that may be saturated
 _SATURATION = 0.999  # a sample is saturated from this fraction of the sensor's range on
@@ -42,7 +42,8 @@ _MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, a
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
 _MIN_REST_WINDOWS = 3  # stationary windows that are needed to measure the magnitude of gravity in them
 _REST_NOISE_FACTOR = 3.0
-"""Multiple of its white noise by which the samples of a stationary sensor may scatter."""
+"""Multiple of its white noise by which the samples of a stationary sensor may scatter, in addition to
+`_REST_GYRO_RAD_S` or `_REST_ACCEL_M_S2`."""
 _REST_GYRO_RAD_S = 0.02  # standard deviation of a stationary gyroscope that is allowed beyond its noise
 _REST_ACCEL_M_S2 = 0.1  # standard deviation of a stationary accelerometer that is allowed beyond its noise
 
@@ -75,9 +76,11 @@ same motion, and the IMU is refused."""
 _MIN_DEGREES_RATIO = 40.0
 """Gyroscope rates divided by camera rates above which the IMU is refused because its unit is degrees per
 second: a degree per second read as rad/s is 57 times too large."""
-_MAX_RATE_RATIO = 1.25  # largest ratio of gyroscope and camera rates, or its inverse, that is not refused
+# Largest ratio of gyroscope rates to camera rates, and vice versa; beyond it the IMU is refused.
+_MAX_RATE_RATIO = 1.25
 _MAX_AXES_ERROR_DEG = 8.0
-"""Largest rotation between the gyroscope's axes and T_imu_camera that is not refused."""
+"""Largest angle, in degrees, by which the gyroscope's axes may be rotated against what ``T_imu_camera``
+states; beyond it the IMU is refused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -21,15 +21,19 @@ __all__ = ["ImuEstimator", "ImuScale", "level_start_pose"]
 
 _POSE_STEP_S = 0.2  # smallest time between two successive poses that are aligned with the IMU
 _MAX_POSES = 150  # most poses that are aligned with the IMU: those of the last 30 seconds
-_MIN_POSES = 8  # fewest poses that are aligned with the IMU
+_MIN_POSES = 8  # fewest poses that are aligned with the IMU; with fewer, `align` has no result
 _RETRY_S = 0.5  # time between two IMU alignments while gravity or scale is not known well enough
 _REPEAT_S = 2.0  # time between two IMU alignments when both are known well enough; biases still change
 _POSE_NOISE_PX = 0.33
 """Standard deviation of a tracked pose, as the shift of the image in pixels: of the rotation it is 0.33 / fx
 rad, of the position 0.33 / fx times the median depth."""
-_MAX_SCALE_DEVIATION = 0.015  # largest standard deviation of a scale that is used, divided by the scale
-_MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of a direction of gravity in use
-_MAX_MISFIT = 12.0  # largest misfit of an alignment that is used; it is 1 if the noise is as stated
+# Largest standard deviation of a scale divided by the scale; above it the scale counts as unknown.
+_MAX_SCALE_DEVIATION = 0.015
+# Largest standard deviation of the direction of gravity; above it gravity counts as unknown.
+_MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)
+# Largest misfit (`ImuAlignment.misfit`) of an alignment that is used; it is 1 if the noise is as stated.  An
+# alignment with a larger one is discarded.
+_MAX_MISFIT = 12.0
 _MAX_MISFITS_IN_A_ROW = 3
 """After this many successive alignments with a misfit above `_MAX_MISFIT` the IMU is not used any more; the
 cause of fewer may be a wrong pose."""
@@ -41,7 +45,8 @@ _MAX_CACHED_MOTIONS = 4 * _MAX_POSES
 than `_MAX_POSES`, so this happens rarely."""
 _RATE_CHECK_S = 20.0  # the rotations of the poses of this many last seconds are compared with the gyroscope
 _MAX_MOTION_S = 10.0  # longest preintegrated motion that a keyframe contains: longer ones are too uncertain
-_MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity's direction that a keyframe states
+# Smallest standard deviation of gravity's direction that a keyframe states; it replaces a smaller estimate.
+_MIN_GRAVITY_DEVIATION_RAD = 1e-3
 _MAX_STATIONARY_ERROR = 0.25
 """Largest difference between the magnitude of the mean specific force and 9.81 m/s^2, as a fraction of the
 latter, with which `stationary_gravity` returns a result."""
@@ -168,7 +173,7 @@ class ImuEstimator:
     def gravity_m_s2(self) -> Array | None:
         """Gravity ``(3,)``, m/s^2, in the world of the last aligned poses.
 
-        None unless the standard deviation of its direction is at most 0.5 degrees.
+        None without an alignment, or if the standard deviation of its direction is above 0.5 degrees.
         """
         alignment = self.alignment
         if alignment is None or alignment.gravity_deviation_rad > _MAX_GRAVITY_DEVIATION_RAD:
@@ -301,7 +306,10 @@ class ImuScale:
         """Do nothing: the mapper passes the IMU samples of frames to the `ImuEstimator` itself."""
 
     def is_due(self, timestamp_s: float, *, is_known: bool) -> bool:
-        """Return whether the scale should be estimated again; it is repeated even if the scale is known."""
+        """Return whether the scale should be estimated at the frame of *timestamp_s*.
+
+        *is_known*, whether there is a scale already, is not used: the estimate is repeated.
+        """
         return self._imu.is_due(timestamp_s)
 
     def metres_per_unit(

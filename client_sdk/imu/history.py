@@ -56,8 +56,8 @@ class ImuHistory:
 
         Returns:
             Samples with time stamps on the clock of the IMU.  None if two successive samples of the interval
-            are more than 5 sampling intervals apart, if the first known sample is after the begin, or if the
-            last one is more than 1.5 sampling intervals before the end.
+            are more than 5 sampling intervals apart, if the first known sample is after the begin, if the
+            last one is more than 1.5 sampling intervals before the end, or if there are fewer than two.
         """
         samples = self.to_array()
         begin_s, end_s = begin_s + shift_s, end_s + shift_s

@@ -17,10 +17,12 @@ from rse_pf.geometry import Array, rigid
 __all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples", "check_samples"]
 
 MAX_SAMPLES = 100_000
-"""Most IMU samples that one frame may have: 20 seconds of an IMU at 5 kHz."""
+"""Most IMU samples that one frame may have: 20 seconds of an IMU at 5 kHz.  A frame with more is refused."""
 _MIN_RATE_HZ = 10.0  # smallest rate of an IMU: below it the camera itself measures rotations more often
 _MAX_RATE_HZ = 10_000.0  # largest rate of an IMU: a larger number is probably not in Hz
-_MAX_LEVER_ARM_M = 10.0  # longest distance between IMU and camera: a larger number is probably not in metres
+# Largest coordinate of the camera in the frame of the IMU, in metres: a larger number is refused, since it is
+# probably not in metres.
+_MAX_LEVER_ARM_M = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,8 +41,8 @@ class ImuModel:
         max_accel: Acceleration at which the accelerometer saturates, m/s^2.
 
     Raises:
-        UsageError: *T_imu_camera* is not a rigid motion, its translation is above 10 m, or another number is
-            outside its range.
+        UsageError: *T_imu_camera* is not a rigid motion, its translation is above 10 m on an axis, or another
+            number is outside its range.
     """
 
     T_imu_camera: Array

@@ -22,7 +22,9 @@ __all__ = [
     "read_text",
 ]
 
-_MAX_FILE_BYTES = 64 << 20  # largest text file of a recording that is read; the longest ones list IMU samples
+# Largest text file of a recording that is read, 64 MiB (the longest ones list IMU samples); a larger one is
+# refused.
+_MAX_FILE_BYTES = 64 << 20
 _HINT = "unpack the recording again"
 _EUROC_IMU_FIELDS = {
     "gyro_noise": "gyroscope_noise_density",

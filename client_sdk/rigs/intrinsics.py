@@ -47,9 +47,10 @@ __all__ = [
 
 _T = TypeVar("_T")
 _MAX_FILE_BYTES = 1 << 20
-"""Largest intrinsics.json or rig.json that is read; a real file has some hundred bytes."""
+"""Largest intrinsics.json or rig.json that is read, 1 MiB; a larger file is refused, and a real one has some
+hundred bytes."""
 _MIN_DEPTH_SCALE = 1e-2
-"""Smallest depth_scale: with 0.01 one unit of a depth image is 100 m, too coarse to map."""
+"""Smallest accepted depth_scale: with 0.01 one unit of a depth image is 100 m, too coarse to map."""
 _MAX_DEPTH_SCALE = 1e7  # largest depth_scale: with 10^7 the largest value of 16 bits is 7 mm, too near to map
 _MIN_RATE_HZ = 1e-3  # smallest rate_hz: between slower images no motion could be tracked
 _MAX_RATE_HZ = 1e4  # largest rate_hz: no camera is faster
@@ -167,7 +168,7 @@ class Intrinsics(Lens):
 
 
 def read_json(path: Path, hint: str) -> Any:
-    """Return the content of a JSON file of intrinsics of at most 1 MiB.
+    """Return the content of a JSON file of intrinsics or of a rig, of at most 1 MiB.
 
     Raises:
         UsageError: The file is missing (its hint says how to calibrate); or the file cannot be read, is too
@@ -200,7 +201,8 @@ def parse_intrinsics(values: Any) -> Intrinsics:
     """Return the intrinsics that a decoded JSON object states; call it within `name_file_in_errors`.
 
     Raises:
-        UsageError: A field is unknown or stated twice, or a number is impossible.
+        UsageError: A field is unknown, two names of one field state different values, or a number is
+            impossible.
         InvalidCamera: The numbers of the pinhole camera are impossible.
         KeyError, ValueError, TypeError, AttributeError: A field is missing, or has another type.
     """

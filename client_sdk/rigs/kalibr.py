@@ -22,7 +22,8 @@ from rse_pf.geometry import Array, Camera, inverse
 __all__ = ["read_kalibr"]
 
 _MAX_FILE_BYTES = 1 << 18
-"""Largest file of Kalibr that is read: a camchain of eight cameras has some kilobytes."""
+"""Largest file of Kalibr that is read, 256 KiB; a larger one is refused, and a camchain of eight cameras has
+some kilobytes."""
 _CAMCHAIN_HINT = "name the camchain that kalibr_calibrate_cameras or kalibr_calibrate_imu_camera wrote"
 _IMU_HINT = "give the noise densities and random walks of the IMU, and update_rate, as imu.yaml has them"
 _CAMERA_NAMES = ("left", "right")  # names of cam0 and cam1 in the rig; further cameras keep their names
@@ -66,7 +67,7 @@ def read_kalibr(path: Path) -> Rig:
 
 
 def _parse_lens(stated: Any) -> Intrinsics:
-    """Return the lens of a camera of a camchain.
+    """Return the lens of a camera; *stated* are its fields in the camchain.
 
     Raises:
         UsageError: The projection is not pinhole, or the distortion model is not known.

@@ -18,10 +18,13 @@ from rse_pf.geometry import Array, Camera, inverse, rectify_stereo_pair
 
 __all__ = ["Rectification"]
 
-_MIN_BASELINE_M = 0.001  # smallest distance of the two cameras: a smaller one means that a pose is missing
+# Smallest distance of the two cameras in metres: a smaller one means that a pose is missing, and the pair is
+# refused.
+_MIN_BASELINE_M = 0.001
 _MIN_SIDEWAYS_SHARE = 0.7
 """Smallest absolute x of the right camera's position in the frame of the left camera, as a fraction of the
-distance: with a smaller one the cameras are not side by side, but above or in front of each other."""
+distance: with a smaller one the cameras are not side by side, but above or in front of each other, and the
+pair is refused."""
 _RECTIFIED_TOLERANCE = 1e-9
 """A pair whose lenses are equal pinholes counts as rectified already if no element of the ``(4, 4)`` pose
 between its cameras deviates by this or more from a translation along x (no unit in the rotation, metres in

@@ -60,7 +60,7 @@ the middle 80 % of the row offsets all lie beyond it on one side, this fault is 
 estimated."""
 _MIN_DELAY_S = 0.004  # a shorter time between the two images of a pair is not reported as a delay
 _MIN_DELAY_EFFECT_PX = 0.7
-"""A delay that makes row offsets scatter (standard deviation) by less is not reported."""
+"""A delay is not reported if the standard deviation of the row offsets that it causes is not above this."""
 _MIN_EXPLAINED_VARIANCE = 0.3  # share of the variance of row offsets that a reported delay must explain
 _FAST_PX_S = 15.0
 """A feature that moves up or down in the image faster than this is fast: a delay shows in it."""
@@ -68,7 +68,7 @@ _MAX_RESIDUAL_PX = 2.0  # a match whose row offset differs by more from that of 
 _ALL_FAST_SHARE = 0.9
 """If more than this share of the features is fast, the slow ones are too few to measure the row offset that
 the rectification causes; the median row offset of all features is subtracted instead."""
-_REFINEMENTS = 5  # least-squares fits of the delay, each to the inliers of the fit before
+_REFINEMENTS = 5  # number of least-squares fits of the delay, each to the inliers of the previous estimate
 _MAX_PAIRS = 14  # most stereo pairs of a recording that are compared when it is opened, since each takes time
 
 
@@ -159,7 +159,7 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
     disparities_px, row_offsets_px, row_rates_px_s = columns
     if len(row_offsets_px) < _MIN_MATCHES:
         return None
-    # 1. Report swapped cameras: most points lie farther right in the right image.
+    # 1. Report swapped cameras if most points lie farther right in the right image.
     swapped_share = float(np.mean(disparities_px < _MIN_SWAPPED_DISPARITY_PX))
     if swapped_share > _SWAPPED_SHARE:
         return PairFault(

@@ -1,9 +1,8 @@
 """ORB features of one image: detected, spread over the image, and described.
 
 Every part of the platform that compares an image with keyframes gets its ORB features here.  The native core
-detects and describes them, and OpenCV gives the same bytes.  OpenCV is used instead on processors without
-AVX2, to describe also on those without FMA, and to describe the keypoints of an image of which one lies near
-the edge.
+detects and describes them, and OpenCV gives the same bytes.  OpenCV is used where the core returns no result
+(see `detect_keypoints` and `describe_keypoints`), such as on processors without AVX2, and by `describe_at`.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ __all__ = [
 _Floats = npt.NDArray[np.floating[Any]]
 
 _PYRAMID_SCALE = 1.2
-"""Ratio of the sizes of two neighbouring levels of ORB's image pyramid, as in Rublee et al., ICCV 2011."""
+"""Ratio of the sizes of two neighbouring levels of ORB's image pyramid: the default of OpenCV's ORB."""
 _PYRAMID_LEVELS = 8
-"""Number of levels of ORB's image pyramid, as in Rublee et al., ICCV 2011."""
+"""Number of levels of ORB's image pyramid: the default of OpenCV's ORB."""
 _LEVEL_SIZES: Array = np.power(_PYRAMID_SCALE, np.arange(_PYRAMID_LEVELS, dtype=np.float64))
 _CORE_LEVEL_SIZES = np.array(
     [float(np.float32(_PYRAMID_SCALE)) ** level for level in range(_PYRAMID_LEVELS)], dtype=np.float32
@@ -131,8 +130,8 @@ def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = Tr
         MissingExtra: OpenCV or the native core is not installed.
 
     Source:
-        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011; pyramid scale 1.2, 8
-        levels, FAST threshold 7 where features are spread, and 10 where they are not.
+        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.  Pyramid scale 1.2 and 8
+        levels are the defaults of OpenCV; the FAST threshold is 7 where features are spread, else 10.
     """
     cv2 = load_opencv()
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -213,7 +212,7 @@ def select_spread_rows(pixels: _Floats, responses: _Floats, size: tuple[int, int
 
 
 class _DetectRequest(ctypes.Structure):
-    """``rse_pf_detect_request`` of ``rse_pf_match.h``."""
+    """The C struct ``rse_pf_detect_request`` of ``rse_pf_match.h``."""
 
     _fields_ = (
         ("gray", ctypes.c_void_p),
@@ -275,8 +274,8 @@ def describe_keypoints(gray: npt.NDArray[np.uint8], keypoints: Keypoints) -> npt
     """Compute the ``(n, 32)`` ORB descriptors of keypoints of an ``(h, w)`` image by the native core.
 
     Returns:
-        None where the processor lacks AVX2 or FMA, or a keypoint is nearer than 22 px to the edge of its
-        pyramid level.
+        None, so that the caller uses OpenCV, if the processor lacks AVX2 or FMA, a keypoint is nearer than
+        22 px to the edge of its pyramid level, or an angle is not finite.
 
     Raises:
         MissingExtra: The native core is not installed.
@@ -284,7 +283,8 @@ def describe_keypoints(gray: npt.NDArray[np.uint8], keypoints: Keypoints) -> npt
     gray, pixels, octaves = aligned(gray), aligned(keypoints.pixels), aligned(keypoints.octaves)
     height, width = gray.shape
     angles = (keypoints.angles_deg * _RADIANS_PER_DEGREE).astype(np.float64)
-    with np.errstate(invalid="ignore"):  # the native core refuses angles that are not finite
+    # No warning for an angle that is not finite: the native core refuses the request, and None is returned.
+    with np.errstate(invalid="ignore"):
         cosines, sines = np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
     descriptors = np.empty((len(pixels), ORB.size), dtype=np.uint8)
     workspace = _WORKSPACE.words(3 * width * height // 8 + 7 * width + 64)

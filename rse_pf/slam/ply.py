@@ -21,7 +21,8 @@ Points = npt.NDArray[np.float32]
 Colours = npt.NDArray[np.uint8]
 """Colours of points ``(n, 3)``, red, green and blue."""
 
-_MAX_HEADER_BYTES = 4096  # largest length in bytes of the text header of a PLY file
+# Largest length in bytes of the text header of a PLY file; a file with a longer one is refused.
+_MAX_HEADER_BYTES = 4096
 _DTYPES = {
     "char": "i1",
     "uchar": "u1",

@@ -27,12 +27,15 @@ __all__ = [
 ]
 
 _UPPER = np.triu_indices(6)
-_MAX_ID = 2**53  # largest id of a vertex in g2o text: JSON and float64 hold it exactly
-_MAX_COORDINATE_M = 1e9  # largest coordinate of a pose in metres; larger ones overflow in the optimiser
-_MAX_INFORMATION = 1e18  # largest number of an information matrix; larger ones overflow in the optimiser
+_MAX_ID = 2**53  # largest absolute id of a vertex in g2o text: JSON and float64 hold it exactly
+# Largest absolute coordinate of a pose in metres, beyond any map; a graph with a larger one is refused.
+_MAX_COORDINATE_M = 1e9
+# Largest absolute number of an information matrix, a standard deviation of 1 nm or 1 nrad; a graph with a
+# larger one is refused.
+_MAX_INFORMATION = 1e18
 _MAX_ASYMMETRY = 1e-6
 """Largest absolute element of an information matrix minus its transpose, as a share of the largest absolute
-element of the matrix."""
+element of the matrix.  A matrix with a larger one is refused as not symmetric."""
 _FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 """Derivative of g2o's error (translation, vector part of a quaternion) by our twist: the vector part of a
 quaternion is half of a small rotation vector."""
@@ -43,7 +46,8 @@ _TO_G2O = np.linalg.inv(_FROM_G2O)
 class PoseGraph:
     """A pose graph of *n* poses and *m* edges, which is validated when it is made.
 
-    The rotations of ``T_world_pose`` and ``T_a_b`` are made orthonormal, in new arrays.
+    Rotations in ``T_world_pose`` and ``T_a_b`` that are not exact are replaced by the nearest rotations, in a
+    copy of the array (`rse_pf.geometry.rigid_many`).
 
     Attributes:
         T_world_pose: ``(n, 4, 4)``, metres.
@@ -271,7 +275,10 @@ def _parse_pose(words: list[str]) -> Array:
 
 
 def _checked_poses(subject: str, T: Array) -> Array:
-    """Return poses with orthonormal rotations; raises BadRequest about *subject* if a matrix is no pose."""
+    """Return poses *T* ``(n, 4, 4)`` with exact rotations; raises BadRequest if one is no pose.
+
+    *subject*, such as "an edge", begins the message of the error.
+    """
     poses = rigid_many(T, _MAX_COORDINATE_M)
     if poses is None:
         raise BadRequest(

@@ -61,7 +61,7 @@ _CONVERGED_SHARE = 1e-4  # an adjustment ends when a step lowers the cost by les
 _FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
 _MIN_DAMPING = 1e-9  # Levenberg-Marquardt's share of the diagonal is not lowered below this
 _MAX_DAMPING = 1e4  # an adjustment ends when no step with damping up to this share lowers the cost
-# Smallest depth in metres with which a landmark is projected, also a nearer one or one behind the camera.
+# Depth in metres at which a landmark is projected that is nearer than this depth, or behind the camera.
 _MIN_DEPTH_M = 0.02
 _BEHIND_COST = 1e3
 """Cost, far above that of an outlier, of a pixel whose landmark is behind the camera or nearer than
@@ -71,9 +71,15 @@ _IMAGE_CELLS = 6
 """Number of columns, and of rows, of regions into which images are divided; errors within a region count as
 correlated."""
 _MAD_TO_SIGMA = 1.4826  # quotient of standard deviation and median absolute deviation of normal noise
-_MIN_PIXEL_FACTOR = 0.05  # smallest ratio of the noise of pixels to their stated deviations
-_MIN_DEPTH_FACTOR = 0.1  # smallest ratio of the noise of depths to their stated deviations
-_MIN_DEPTHS = 20  # number of depths of a drive above which their noise is estimated from residuals
+# Smallest ratio of the noise of pixels, estimated from residuals, to their stated deviations; it replaces a
+# smaller one.
+_MIN_PIXEL_FACTOR = 0.05
+# Smallest ratio of the noise of depths, estimated from residuals, to their stated deviations; it replaces a
+# smaller one.
+_MIN_DEPTH_FACTOR = 0.1
+# Number of depths of a drive above which their noise is estimated from residuals; up to it, the noise is that
+# of their stated deviations.
+_MIN_DEPTHS = 20
 _MAX_PARTS = 4  # largest number of parts of a drive that are adjusted alone to see whether they agree
 _MIN_PART_KEYFRAMES = 6
 """Smallest number of keyframes of a part of a drive that is adjusted alone: fewer do not determine the
@@ -275,7 +281,7 @@ def adjust_with_calibration(
     cost = system.cost(state)
     try:
         for iteration in range(_ZOOM_ITERATIONS if zooms else _ITERATIONS):
-            # 1. Take the first step of growing damping that lowers the cost.
+            # 1. Linearise, and try steps with growing damping until one lowers the cost; end if none does.
             system.linearise(state)
             next_state, next_cost = state, np.inf
             while damping <= _MAX_DAMPING:

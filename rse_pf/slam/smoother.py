@@ -20,7 +20,7 @@ Rows = npt.NDArray[np.int64]
 _MAX_ITERATIONS = 6  # largest number of Gauss-Newton steps of one call of `smooth`
 _MAX_STEP_TRIALS = 4
 """Largest number of trials of a Gauss-Newton step.  After each trial that increases the cost, the step is
-shortened by the factor `_STEP_REDUCTION`."""
+shortened by the factor `_STEP_REDUCTION`; if all trials do, the step is not made, and the iterations end."""
 _STEP_REDUCTION = 0.25  # factor by which a Gauss-Newton step that increases the cost is shortened
 _CONVERGED_M = 6e-3
 """If a Gauss-Newton step moves no pose by this translation in metres along an axis, nor by `_CONVERGED_RAD`,
@@ -162,7 +162,7 @@ def smooth(
         largest_m, largest_rad = np.abs(step[:, :3]).max(), np.abs(step[:, 3:]).max()
         if has_small_decrease or (largest_m < _CONVERGED_M and largest_rad < _CONVERGED_RAD):
             break
-    # 6. Pick the covariances out of the last solution.
+    # 6. Take the covariances of the wanted poses out of the last solution.
     rows = 6 * wanted[:, None] + np.arange(6)
     columns = 1 + 6 * np.arange(len(wanted))[:, None] + np.arange(6)
     return SmoothedPoses(

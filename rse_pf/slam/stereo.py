@@ -80,7 +80,7 @@ def stereo_noise(f_baseline: float, disparity_px: float) -> DepthNoise:
 
 
 class StereoRequest(ctypes.Structure):
-    """``rse_pf_stereo_request`` of ``rse_pf_stereo.h``."""
+    """The C struct ``rse_pf_stereo_request`` of ``rse_pf_stereo.h``."""
 
     _fields_ = (
         ("abi", ctypes.c_uint32),

@@ -52,10 +52,11 @@ half of it on either side, so that the keys of two bands never overlap."""
 _MAX_PIXEL_PX = 1e9
 """Features and predictions whose pixel coordinates exceed this absolute value match nothing."""
 _MIN_LANDMARK_DEPTH_M = 0.1
-"""Smallest depth of a landmark that is predicted: nearer, a small error of the pose moves its pixel far."""
+"""Smallest depth of a landmark that is predicted in an image: of a nearer landmark, a small error of the pose
+moves the pixel far, so that it is not matched."""
 _MIN_VIEW_COSINE = 0.6
-"""Smallest cosine between the present and the last viewing ray of a landmark (53 degrees): seen from another
-direction, a landmark has another descriptor."""
+"""Smallest cosine between the present and the last viewing ray of a landmark that is predicted (53 degrees):
+seen from another direction, a landmark has another descriptor."""
 _MAX_APPROACH_RATIO = 2.0
 """A landmark is not predicted where its distance from the camera is less than that from the camera of the
 last image that showed it, divided by this ratio: its descriptor then shows another scale."""
@@ -294,7 +295,7 @@ class _FitRequest(ctypes.Structure):
 
 
 class _FitResult(ctypes.Structure):
-    """``rse_pf_fit_result`` of ``rse_pf_track.h``."""
+    """Fitted pose, the C struct ``rse_pf_fit_result`` of ``rse_pf_track.h``."""
 
     _fields_ = (("inliers", _I), ("T_camera_world", _D * 16), ("information", _D * 36))
 
@@ -317,8 +318,8 @@ def predict_features(
 ) -> tuple[Rows, PredictedFeatures]:
     """Predict how a camera at a pose sees landmarks.
 
-    A landmark is predicted if it lies before the camera, within the image and its margin, and is seen from a
-    similar direction and distance as in the last image that showed it.
+    A landmark is predicted if it lies more than 0.1 m before the camera, within the image and its margin, and
+    is seen from a similar direction and distance as in the last image that showed it.
 
     Args:
         landmarks: All landmarks.
@@ -332,7 +333,8 @@ def predict_features(
         ``(k,)`` ascending indices *i*: landmark ``candidates[i]`` is predicted; and the *k* predicted
         features.
     """
-    # 1. Project the landmarks, and keep those before the camera and in the image with its margin.
+    # 1. Project the landmarks, and keep those more than 0.1 m before the camera and in the image with its
+    #    margin.
     points = transform(T_camera_world, landmarks.points[candidates])
     rows = np.flatnonzero(points[:, 2] > _MIN_LANDMARK_DEPTH_M)
     pixels = camera.project(points[rows])
@@ -524,7 +526,7 @@ def _make_near_request(
 def _call_matcher(
     function: Any, requests: Sequence[ctypes.Structure], predicted_count: int, feature_count: int
 ) -> tuple[Rows, Rows]:
-    """Call a matching function of the native core; return the rows that match on both sides.
+    """Call a matching function of the native core; return the matching rows of predictions and of features.
 
     There are none if the core refuses a size: more than 2^24 rows.
     """
@@ -553,14 +555,15 @@ def _thresholds(limits: GuidedMatchLimits, image: Features) -> tuple[float, floa
 def _match_by_numpy(
     predicted: PredictedFeatures, image: Features, limits: GuidedMatchLimits
 ) -> tuple[Rows, Rows]:
-    """Match predicted features with descriptors of any kind, as `match_predictions` describes."""
+    """Match predicted features of a kind other than ORB, as `match_predictions` describes."""
     radius_px, lowe_ratio, distinctiveness_ratio, min_cosine, max_size_ratio, max_bits = _thresholds(
         limits, image
     )
     empty = np.empty(0, dtype=np.int64)
     if not len(predicted.pixels) or not len(image):
         return empty, empty
-    # 1. Pair predictions and features within the radius whose orientations and sizes are similar.
+    # 1. For a kind other than ORB (the native core matches ORB): pair predictions with the features of the
+    #    image that lie within the radius and have a similar orientation and size.
     with np.errstate(invalid="ignore", over="ignore"):
         rows, features = _find_pairs_within(
             np.asarray(predicted.pixels, np.float64), np.asarray(image.pixels, np.float64), radius_px

@@ -10,8 +10,8 @@ from rse_pf.geometry import Array, Camera, transform
 __all__ = ["parallax_deg", "reprojection_errors", "triangulate"]
 
 _MIN_DEPTH = 1e-3
-"""Smallest depth of a point before a camera, in the unit of the poses: nearer, a projection is
-meaningless."""
+"""Smallest depth of a point before a camera, in the unit of the poses.  A nearer point, whose projection is
+meaningless, is not accepted, and has an infinite reprojection error."""
 _MIN_HOMOGENEOUS_SCALE = 1e-9
 """Absolute value of the fourth coordinate of a homogeneous vector of length 1 below which the triangulated
 point counts as lying at infinity."""
