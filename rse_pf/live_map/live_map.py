@@ -251,7 +251,7 @@ class LiveMap:
         return version_of(self._graph)
 
     def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
-        """Return the stored point clouds of the keyframes of *version*, which `to_version` just returned."""
+        """Return where the metric point clouds of *version*, which `to_version` just returned, are stored."""
         return point_sources(self._graph, version)
 
     def image_references(self, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:

@@ -47,7 +47,8 @@ MIN_WRONG_LOG_SCALE = 0.04
 wrong, if it is also above `MIN_WRONG_SCALE_DEVIATIONS`; the depths of the three robots of the 7-Scenes red
 kitchen recordings differ by 1 to 2 %."""
 MIN_WRONG_SCALE_DEVIATIONS = 2.0
-"""Standard deviations of the measured logarithm from which on one metric scale counts as wrong."""
+"""Standard deviations of the measured logarithm of this ratio from which on one metric scale counts as wrong,
+if the logarithm is also above `MIN_WRONG_LOG_SCALE`."""
 
 LOOP_CLOSURE_EVIDENCE = RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.3, min_matches=15)
 """Evidence that the measured relative pose of two keyframes needs to become a pending loop closure.  It is

@@ -117,10 +117,10 @@ def decide_measured(
 
 
 def decide_edges(graph: MapGraph, keyframe: int, numbers: Sequence[int]) -> Iterator[Decision]:
-    """Accept, reject or leave pending the loop closures *numbers* of *keyframe*, and join components by them.
+    """Accept or leave pending the loop closures *numbers* of *keyframe*, and join components by them.
 
     Loop closures without enough support stay pending.  Other pending ones may be accepted together with
-    *numbers*, and accepted ones that *numbers* outweigh are rejected.
+    *numbers*; accepted ones that *numbers* outweigh, or that are at perceptual aliases, may be rejected.
     """
     # 1. Decide about the loop closures within the component of the keyframe by the poses of the graph.
     component = int(graph.components[keyframe])

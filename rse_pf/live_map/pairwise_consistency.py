@@ -97,8 +97,8 @@ ALIAS_DISTANCE_M = 1.0
 """Metres between two estimates of one pose above which they are taken for poses at two places that look the
 same, and not for one place with an error."""
 RIVAL_WEIGHT = 0.5
-"""Share of the weight of the best consistent set from which on a second set, whose loop closures give another
-relative pose of both components, makes the join ambiguous."""
+"""Share of the weight of the best consistent set from which on a second set makes the join ambiguous, if its
+loop closures give a relative pose of both components that differs by more than `ALIAS_DISTANCE_M`."""
 
 
 class DirectedEdge(NamedTuple):

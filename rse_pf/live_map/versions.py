@@ -67,7 +67,7 @@ def as_internal_error(prefix: str) -> Iterator[None]:
 
 
 def started_from(version: MapVersion, source: str) -> MapStarted:
-    """Return the event by which a live map starts from *version*, whose name is *source* (MAP@NUMBER).
+    """Return the event by which a live map starts from *version*, whose full name is *source* (``MAP@ID``).
 
     Features without a depth are left out; the point cloud of the version is left out as well.
     ``equal_rooms_m`` of the event is 0; the caller sets it.

@@ -44,7 +44,7 @@ def read_regular_file(path: Path) -> bytes:
 
 
 def list_files(folder: Path) -> Iterator[Path]:
-    """Yield the paths of all files and links below *folder*, in the order of their names."""
+    """Yield the paths of all regular files and links below *folder*, sorted."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() or path.is_symlink():
             yield path

@@ -32,7 +32,7 @@ __all__ = [
     "register",
 ]
 
-Survey = tuple[tuple[float, float, float], Mapping[str, float]]
+_SurveyScan = tuple[tuple[float, float, float], Mapping[str, float]]
 """One scan of a survey: its position (metres, map frame), and the received strengths (dBm) by hashed access
 point."""
 
@@ -213,7 +213,7 @@ class Locator:
         RSS 2006; the power ("tempering") after Grunwald and van Ommen, Bayesian Analysis 2017.
     """
 
-    def __init__(self, survey: Sequence[Survey], options: WifiOptions | None = None) -> None:
+    def __init__(self, survey: Sequence[_SurveyScan], options: WifiOptions | None = None) -> None:
         """Fit the signal fields of *survey*, predict them at the grid points, and calibrate the power.
 
         Raises:
@@ -295,7 +295,7 @@ def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array
     return mean, _weighted_quantile(distance, weight, _RADIUS_PROBABILITY)
 
 
-def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
+def _calibrate_temper(survey: Sequence[_SurveyScan], model: SignalModel, options: WifiOptions) -> float:
     """Return the power of the likelihood at which 68 % of the held-out positions lie within their radius.
 
     The radius is that of `_posterior` around the position that is estimated for the held-out scan.  A scan is
@@ -343,7 +343,7 @@ def _surveyed_position(fingerprint: Fingerprint) -> tuple[float, float, float]:
     return position
 
 
-def _check_work(survey: Sequence[Survey], options: WifiOptions) -> None:
+def _check_work(survey: Sequence[_SurveyScan], options: WifiOptions) -> None:
     """Raise LimitExceeded if *survey* is beyond `_MAX_FLOORS`, `_MAX_POSTERIORS` or `_MAX_PREDICTIONS`."""
     if not survey:
         return

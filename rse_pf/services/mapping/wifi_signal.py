@@ -29,7 +29,8 @@ _SMOOTH_SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
 """Candidates for the share of the variance of the residuals that is explained by the Gaussian process, a
 smooth function of the position.  The rest of the variance is independent noise of each reading."""
 _MIN_VARIANCE_DBM2 = 1.0
-"""Smallest variance of the noise (dBm^2), so that no reading counts as exact."""
+"""Smallest variance of the noise (dBm^2), to which smaller ones are raised, so that no reading counts as
+exact."""
 _NEAR_M = 1.0
 """Length n in metres with which each distance d from an access point becomes sqrt(d^2 + n^2), since log10 of
 0 is not finite."""

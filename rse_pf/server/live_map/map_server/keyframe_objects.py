@@ -151,11 +151,11 @@ class KeyframeObjects:
             self.delete([self._culled.popleft()])
 
     def _read_points(self, source: PointSource, old_cache: dict[str, bytes]) -> tuple[Array, Colours] | None:
-        """Return the points (m, in the camera frame) and colours of one keyframe.
+        """Return the ``(n, 3)`` points (metres, camera frame) and ``(n, 3)`` colours of one keyframe.
 
-        Points that are too far away are left out.  None if the object is missing, has another size or digest
-        than the keyframe says, or holds no valid points.  The bytes are kept in the cache if there is room.
-        *old_cache* has the objects that were kept for the last cloud, by object name.
+        Points beyond `_MAX_DISTANCE_M` are left out.  Return None if the object is missing, has another size
+        or digest than the keyframe says, or holds no valid points.  The encoded points are stored in the new
+        cache up to `_MAX_CACHED_BYTES`; *old_cache*, by object name, has those of the last cloud.
         """
         digest, size_bytes = source.reference.digest, source.reference.size
         name = f"objects/{source.robot}/{digest}"

@@ -43,9 +43,9 @@ _SHORT_QUEUE = 4
 """With at most this number of waiting keyframes, each keyframe is compared with all candidates that the map
 chooses."""
 _CANDIDATES_WITH_LONG_QUEUE = 6
-"""Number of candidates with which a keyframe is compared while 5 to 8 keyframes wait for measurement."""
+"""Most candidates with which a keyframe is compared while 5 to 8 keyframes wait for measurement."""
 _CANDIDATES_WITH_VERY_LONG_QUEUE = 4
-"""Number of candidates with which a keyframe is compared while more than 8 keyframes wait for measurement."""
+"""Most candidates with which a keyframe is compared while more than 8 keyframes wait for measurement."""
 _OPTIMISATION_NICE = 10
 """Niceness of the child process that optimises a whole graph: keyframes and poses have priority."""
 _MAX_OPTIMISATION_S = 120.0

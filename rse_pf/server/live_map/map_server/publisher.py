@@ -126,14 +126,15 @@ class Publisher:
             return await self._publish(note, freed_bytes)
 
     def request(self, note: str) -> None:
-        """Let `publish_due` publish the map once, with this *note*, if the map has changed."""
+        """Make a version with this *note* due until it is published; do nothing if the map is unchanged."""
         if self._is_changed:
             self._due_request = _Request(note)
 
     async def publish_due(self) -> None:
         """Publish the due version if ``live.publish_pause_s`` has passed since the last version.
 
-        Do nothing if no version is due, a publication is under way, or one has failed less than 30 s ago.
+        Do nothing if no version is due (see `request`), a publication is under way, or one has failed less
+        than 30 s ago.
         """
         if not self._lock.locked() and self._clock() >= max(self._next_allowed_s, self._retry_at_s):
             await self.publish_now()

@@ -180,7 +180,7 @@ class RequestHandler:
         return relocalise_reply(await threads.match(relocalise), position)
 
     async def _leave(self, robot: RobotId) -> dict[str, Any]:
-        """Submit the event `RobotLeft` if the map has the robot; publish the map if no robot is present.
+        """Submit the event `RobotLeft` if the map has the robot; make a version due if no robot is left.
 
         The reply does not wait for the publication.
         """
