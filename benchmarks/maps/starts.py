@@ -78,10 +78,11 @@ OBLIQUE_DEG = (20.0, 30.0, 40.0)  # angle of an oblique plane with the image, on
 RIGHT_DIRECTION_DEG = 30.0  # largest error of the direction of a right relative pose
 RIGHT_ROTATION_DEG = 5.0  # largest error of the rotation of a right relative pose
 
-CORRIDOR_ROOMS = 5  # length of a corridor in rooms of the simulator, 5 m each
+CORRIDOR_ROOMS = 4  # length of a corridor in rooms of the simulator, 5 m each
 CORRIDOR_WIDTH_M = (1.6, 3.0)  # narrowest and widest corridor
 CORRIDOR_FRAMES = 60
 CORRIDOR_SPEED_M_S = (0.5, 1.5)  # slowest and fastest drive
+PAPER_TEXEL_M = ROOM_M / 1024  # the texture of a wallpaper has 1024 texels, so that it covers a room once
 PICTURE_TEXELS = 256  # side of the textures of pictures in a world; other textures have other sizes
 PICTURE_EVERY_M = 1.5  # distance of the pictures along each wall
 
@@ -179,32 +180,42 @@ def backwards(dataset: Dataset, truth: Trajectory) -> tuple[Iterator[Frame], Tra
 
 
 def make_corridor(seed: int) -> World:
-    """Return a straight corridor along x with pictures on both walls, made of faces of a furnished world."""
-    world, rng = make_world(seed), np.random.default_rng([seed, 4])
-    # 1. Stretch the first three faces of the world, which are its floor, its ceiling and a wall.
+    """Return a straight corridor along x with pictures on both walls, made of faces of furnished rooms.
+
+    No two of its faces look alike: each has the wallpaper of another room, which repeats after 5 m.
+    """
+    world, rng = make_world(seed, rooms=3 * CORRIDOR_ROOMS), np.random.default_rng([seed, 4])
     floor, ceiling, wall = world.faces[:3]
-    half_width_m = 0.5 * rng.uniform(*CORRIDOR_WIDTH_M)
+    papers = [face for face in world.faces if (face.axis, face.offset, face.high[1]) == (1, 0.0, HEIGHT_M)]
+    pictures = [face for face in world.faces if len(world.textures[face.texture]) == PICTURE_TEXELS]
+    half_width_m, length_m = 0.5 * rng.uniform(*CORRIDOR_WIDTH_M), CORRIDOR_ROOMS * ROOM_M
     right, left = 0.5 * DEPTH_M - half_width_m, 0.5 * DEPTH_M + half_width_m
     faces: list[Face] = []
+    # 1. Paper the floor and both walls of each room; the ceiling is plain.
     for room in range(CORRIDOR_ROOMS):
+        skins = [papers[3 * room + number].texture for number in range(3)]
         begin, end = room * ROOM_M, (room + 1) * ROOM_M
-        faces += [replace(face, low=(begin, right), high=(end, left), room=room) for face in (floor, ceiling)]
-        side = replace(wall, low=(begin, 0.0), high=(end, HEIGHT_M), room=room)
-        faces += [replace(side, offset=right, sign=1), replace(side, offset=left, sign=-1)]
-    length_m, last = CORRIDOR_ROOMS * ROOM_M, CORRIDOR_ROOMS - 1
+        level = replace(floor, low=(begin, right), high=(end, left), room=room, texel_m=PAPER_TEXEL_M)
+        upright = replace(wall, low=(begin, 0.0), high=(end, HEIGHT_M), room=room, texel_m=PAPER_TEXEL_M)
+        faces += [
+            replace(level, texture=skins[0]),
+            replace(level, offset=HEIGHT_M, sign=-1, colour_0=ceiling.colour_0, colour_1=ceiling.colour_0),
+            replace(upright, offset=right, sign=1, texture=skins[1]),
+            replace(upright, offset=left, sign=-1, texture=skins[2]),
+        ]
+    last = CORRIDOR_ROOMS - 1
     faces.append(
         replace(wall, axis=0, offset=length_m, sign=-1, low=(right, 0.0), high=(left, HEIGHT_M), room=last)
     )
     # 2. Hang pictures of all sizes on both walls, 1 cm before them.
-    pictures = [face for face in world.faces if len(world.textures[face.texture]) == PICTURE_TEXELS]
+    order = iter(rng.permutation(len(pictures)))
     for along in np.arange(0.5, length_m - PICTURE_EVERY_M, PICTURE_EVERY_M):
         for y, sign in ((right, 1), (left, -1)):
             side_m, x, z = rng.uniform(0.4, 1.0), along + rng.uniform(0.0, 0.5), rng.uniform(0.6, 1.4)
             faces.append(
                 replace(
-                    pictures[int(rng.integers(len(pictures)))], axis=1, offset=y + 0.01 * sign, sign=sign,
-                    low=(x, z), high=(x + side_m, z + side_m), texel_m=side_m / PICTURE_TEXELS,
-                    room=int(x // ROOM_M),
+                    pictures[next(order)], axis=1, offset=y + 0.01 * sign, sign=sign, low=(x, z),
+                    high=(x + side_m, z + side_m), texel_m=side_m / PICTURE_TEXELS, room=int(x // ROOM_M),
                 )
             )  # fmt: skip
     return World(tuple(faces), world.textures)
@@ -317,11 +328,10 @@ def photograph(
 
 
 def patch_of(other: Scene, scene: Scene, share: float) -> Image:
-    """Return a corner of another scene's image, with a *share* of the pixels of *scene*."""
-    size = np.rint(np.sqrt(share) * np.array([scene.camera.width, scene.camera.height])).astype(int)
-    corner = other.rgb[: size[1], : size[0]]
-    patch: Image = load_opencv().resize(corner, tuple(size.tolist()))
-    return patch
+    """Return the middle of another scene's image, with a *share* of the pixels of *scene*."""
+    width, height = (round(share**0.5 * side) for side in (scene.camera.width, scene.camera.height))
+    left, top = (other.camera.width - width) // 2, (other.camera.height - height) // 2
+    return other.rgb[top : top + height, left : left + width]
 
 
 def resting_frames(scene: Scene, count: int, seed: int, patch: Image | None = None) -> Iterator[Frame]:
