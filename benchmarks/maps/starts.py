@@ -55,7 +55,7 @@ SCENES = (
 at rest, and the first three as planes."""
 RATE_HZ = 10.0  # frames per second of all sequences but those of KITTI
 
-NOISE = 2.0  # standard deviation of the noise of each pixel, in grey levels of 255
+NOISE = 2.0  # standard deviation of the noise of each pixel, the same in all colours, in grey levels of 255
 GAIN = 0.03  # standard deviation of a frame's brightness, as a share of the scene's
 OFFSET = 2.0  # standard deviation of the level that is added to all pixels of a frame, in grey levels
 SHAKE_DEG = 0.1  # standard deviation of the rotation of a camera at rest about each axis, in each frame
@@ -318,7 +318,7 @@ def photograph(
         clean = cv2.remap(clean, places, None, cv2.INTER_LINEAR)
     # 3. Change the light, and add noise.
     lit = (1.0 + GAIN * rng.standard_normal()) * clean.astype(np.float32) + OFFSET * rng.standard_normal()
-    noisy = lit + NOISE * rng.standard_normal(clean.shape, dtype=np.float32)
+    noisy = lit + NOISE * rng.standard_normal((*clean.shape[:2], 1), dtype=np.float32)
     return Frame(
         timestamp_s=number / RATE_HZ,
         rgb=np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
