@@ -60,7 +60,7 @@ decides about them again after a robot was forgotten or excluded; the limit boun
 these decisions."""
 MAX_ORPHANED_OBJECTS = 10_000
 """Most objects of forgotten robots in the list of objects to delete; the oldest entries beyond this number
-are dropped from the list, and their objects are not deleted by it."""
+are dropped from the list, and their objects stay in the store unless they were deleted before."""
 INHERITED_CONTRADICTIONS = 0xFFFF
 """Bit mask of `Segment.contradictions`: a new segment of a robot inherits the newest 16 bits of its last one,
 so that a hostile robot does not start without a record by opening a segment."""

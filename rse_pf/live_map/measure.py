@@ -210,7 +210,7 @@ def _wrong_log_scale(measured: RelativePose) -> float | None:
     """Return the logarithm of the length of the metre of *b* in metres of *a*, None if it is near 0.
 
     Here *a* and *b* are the keyframes of ``T_a_b``.  Near 0 is below 0.04 or two standard deviations, the
-    larger of both.
+    larger of both.  The result is also None if the ratio of depths was not measured.
     """
     ratio = measured.depth_ratio
     if ratio is None:

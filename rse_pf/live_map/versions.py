@@ -162,8 +162,7 @@ def version_of(graph: MapGraph) -> MapVersion:
 
 
 def point_sources(graph: MapGraph, version: MapVersion) -> tuple[PointSource, ...]:
-    """Return where the point clouds of the keyframes of *version*, which was just made of *graph*, are
-    stored.
+    """Return where the point cloud of each keyframe of *version*, just made of *graph*, is stored.
 
     Point clouds of segments that are excluded or not metric are left out.
     """

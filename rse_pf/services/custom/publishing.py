@@ -65,8 +65,8 @@ SERVER_PLATFORM = "cp311-linux-x86_64"
 """Platform tag of servers on AWS, which run Debian 12 on x86-64; packages of services must have the same
 tag."""
 MAX_ARCHIVE_BYTES = 128 << 20
-"""Largest archive of a service in bytes, compressed; larger data, such as models, belongs to the object
-store."""
+"""Largest archive of a service in bytes, compressed; a larger one is neither published nor installed.  Larger
+data, such as models, belong to the object store."""
 CURRENT = "current"
 """Name of the link in a `PublishedFolder` that leads to the services folder that runs."""
 

@@ -44,7 +44,8 @@ class AppliedEntry:
     """The effects of the events of one log entry.
 
     Attributes:
-        outcomes: For each event, what it changed in the map; empty for an event with a defect.
+        outcomes: For each event, its outcomes; empty for an event with a defect, which may be applied in
+            part.
         defects: For each event, the exception that the map raised while the event was applied; else None.
     """
 
