@@ -32,15 +32,19 @@ is refused."""
 
 # Limits of the samples alone, see `find_sample_trouble`
 _MIN_SAMPLES = 100  # fewer IMU samples are not checked, and have no fault: half a second at 200 Hz
-_MAX_MISSING_FRACTION = 0.05  # largest fraction of an IMU's samples that may be missing
-_MAX_SATURATED_FRACTION = 0.01  # largest fraction of an IMU's samples that may be saturated
+_MAX_MISSING_FRACTION = 0.05  # an IMU is refused if a larger fraction of its samples is missing
+_MAX_SATURATED_FRACTION = 0.01  # an IMU is refused if a larger fraction of its samples is saturated
 _SATURATION = 0.999  # a sample is saturated from this fraction of the sensor's range on
 _MIN_IN_G = 0.7  # lower end of the mean magnitudes of an accelerometer that are refused as being in g
 _MAX_IN_G = 1.3  # upper end of the mean magnitudes of an accelerometer that are refused as being in g
-_MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, as a multiple of gravity
-_MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, as a multiple of gravity
+# Smallest mean magnitude of the samples of an accelerometer, as a multiple of gravity; below it the IMU is
+# refused.
+_MIN_MEAN_ACCEL = 0.7
+# Largest mean magnitude of the samples of an accelerometer, as a multiple of gravity; above it the IMU is
+# refused.
+_MAX_MEAN_ACCEL = 1.5
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
-_MIN_REST_WINDOWS = 3  # stationary windows that are needed to measure the magnitude of gravity in them
+_MIN_REST_WINDOWS = 3  # with fewer stationary windows, the magnitude of gravity in them is not checked
 _REST_NOISE_FACTOR = 3.0
 """Multiple of its white noise by which the samples of a stationary sensor may scatter, in addition to
 `_REST_GYRO_RAD_S` or `_REST_ACCEL_M_S2`."""
@@ -48,8 +52,8 @@ _REST_GYRO_RAD_S = 0.02  # standard deviation of a stationary gyroscope that is 
 _REST_ACCEL_M_S2 = 0.1  # standard deviation of a stationary accelerometer that is allowed beyond its noise
 
 # Limits of the comparison with the camera, see `check_rates`
-_MIN_INTERVALS = 30  # intervals between poses that are needed to compare the rates of gyroscope and camera
-_MAX_INTERVAL_S = 0.5  # longest interval between two poses whose mean rate is compared with the gyroscope
+_MIN_INTERVALS = 30  # with fewer intervals between poses, the rates of gyroscope and camera are not compared
+_MAX_INTERVAL_S = 0.5  # an interval between two poses that is longer, in seconds, is left out
 _MIN_RATE_SPREAD_RAD_S = 0.04
 """Smallest standard deviation of the camera's rates, in rad/s, along the second of their three principal axes
 (in the order of their variances) for which rates are compared: slower rotations, or rotations about one axis

@@ -20,7 +20,7 @@ from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_rotation
 __all__ = ["ImuEstimator", "ImuScale", "level_start_pose"]
 
 _POSE_STEP_S = 0.2  # smallest time between two successive poses that are aligned with the IMU
-_MAX_POSES = 150  # most poses that are aligned with the IMU: those of the last 30 seconds
+_MAX_POSES = 150  # most poses that are aligned with the IMU, the newest ones: those of the last 30 seconds
 _MIN_POSES = 8  # fewest poses that are aligned with the IMU; with fewer, `align` has no result
 _RETRY_S = 0.5  # time between two IMU alignments while gravity or scale is not known well enough
 _REPEAT_S = 2.0  # time between two IMU alignments when both are known well enough; biases still change
@@ -44,7 +44,9 @@ _MAX_CACHED_MOTIONS = 4 * _MAX_POSES
 """The cache of preintegrated motions is emptied when it has more than this many.  One alignment uses fewer
 than `_MAX_POSES`, so this happens rarely."""
 _RATE_CHECK_S = 20.0  # the rotations of the poses of this many last seconds are compared with the gyroscope
-_MAX_MOTION_S = 10.0  # longest preintegrated motion that a keyframe contains: longer ones are too uncertain
+# Longest preintegrated motion that a keyframe contains, in seconds: a longer one is too uncertain, and the
+# keyframe is sent without a motion.
+_MAX_MOTION_S = 10.0
 # Smallest standard deviation of gravity's direction that a keyframe states; it replaces a smaller estimate.
 _MIN_GRAVITY_DEVIATION_RAD = 1e-3
 _MAX_STATIONARY_ERROR = 0.25
@@ -133,7 +135,8 @@ class ImuEstimator:
         if not len(timestamps_s) or self.trouble:
             return None
         self._due_s = float(timestamps_s[-1]) + _RETRY_S
-        # 1. Check the samples and the gyroscope; measure the time offset and a first gyroscope bias.
+        # 1. Check the samples and the gyroscope, and end if the IMU may not be used (yet); measure the time
+        #    offset and a first gyroscope bias.
         if not self._check(timestamps_s, T_world_camera):
             return None
         # 2. Choose poses 0.2 s apart, and preintegrate the motions between them.

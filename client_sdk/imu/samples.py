@@ -18,8 +18,9 @@ __all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples", "check_samples"]
 
 MAX_SAMPLES = 100_000
 """Most IMU samples that one frame may have: 20 seconds of an IMU at 5 kHz.  A frame with more is refused."""
-_MIN_RATE_HZ = 10.0  # smallest rate of an IMU: below it the camera itself measures rotations more often
-_MAX_RATE_HZ = 10_000.0  # largest rate of an IMU: a larger number is probably not in Hz
+# Smallest accepted rate of an IMU in Hz: below it the camera itself measures rotations more often.
+_MIN_RATE_HZ = 10.0
+_MAX_RATE_HZ = 10_000.0  # largest accepted rate of an IMU in Hz: a larger number is probably not in Hz
 # Largest coordinate of the camera in the frame of the IMU, in metres: a larger number is refused, since it is
 # probably not in metres.
 _MAX_LEVER_ARM_M = 10.0

@@ -51,9 +51,10 @@ _MAX_FILE_BYTES = 1 << 20
 hundred bytes."""
 _MIN_DEPTH_SCALE = 1e-2
 """Smallest accepted depth_scale: with 0.01 one unit of a depth image is 100 m, too coarse to map."""
-_MAX_DEPTH_SCALE = 1e7  # largest depth_scale: with 10^7 the largest value of 16 bits is 7 mm, too near to map
-_MIN_RATE_HZ = 1e-3  # smallest rate_hz: between slower images no motion could be tracked
-_MAX_RATE_HZ = 1e4  # largest rate_hz: no camera is faster
+# Largest accepted depth_scale: with 1e7 the largest value of 16 bits is 7 mm, too near to map.
+_MAX_DEPTH_SCALE = 1e7
+_MIN_RATE_HZ = 1e-3  # smallest accepted rate_hz: between slower images no motion could be tracked
+_MAX_RATE_HZ = 1e4  # largest accepted rate_hz: no camera is faster
 _DEFAULT_DEPTH_SCALE = 1000.0  # depth_scale if nobody stated it: most depth cameras write millimetres
 _PERSPECTIVE_NAMES = {"pinhole", "perspective", "simple_pinhole", "none", ""}
 """Names in lower case, in a field that states a lens model, of a perspective projection without its

@@ -17,10 +17,13 @@ from rse_pf.geometry import Array, inverse, rigid
 
 __all__ = ["Rig", "RigCamera", "RigImu"]
 
-_MAX_CAMERAS = 8  # most cameras of a rig, of which the first two are used; a longer list is probably no rig
-_MAX_LEVER_ARM_M = 10.0  # largest coordinate of a sensor in the body: a larger number is probably millimetres
-_MAX_TIME_OFFSET_S = 1.0  # largest offset of a camera's clock: a larger number is probably milliseconds
-_MAX_NAME_LENGTH = 64  # most characters of a camera's name, which errors repeat
+# Most cameras of a rig, of which the first two are used; a longer list is refused, and probably is no rig.
+_MAX_CAMERAS = 8
+# Largest coordinate of a sensor in the body in metres; a larger number is refused, and probably millimetres.
+_MAX_LEVER_ARM_M = 10.0
+# Largest offset of a camera's clock in seconds; a larger number is refused, and probably in milliseconds.
+_MAX_TIME_OFFSET_S = 1.0
+_MAX_NAME_LENGTH = 64  # most characters of a camera's name, which errors repeat; a longer name is refused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

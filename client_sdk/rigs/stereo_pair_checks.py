@@ -35,8 +35,8 @@ _MAX_DISTANCE_RATIO = 0.8
 """Ratio of the Hamming distances of the nearest and the second nearest descriptor, from which on a match is
 ambiguous and left out (Lowe's ratio test)."""
 _MAX_PYRAMID_SCALE = 2.0
-"""Largest scale of the image pyramid of a feature that is matched: positions at coarser levels are too
-imprecise."""
+"""Largest scale of the image pyramid of a feature that is matched; features of coarser levels are left out,
+because their positions are too imprecise."""
 _MAX_ROW_OFFSET_PX = 40.0
 """A match whose rows differ by this or more is left out as a wrong match; a calibration that is wrong by so
 much leaves few matches, so its fault is found only if matches with smaller offsets exist, too."""
@@ -61,7 +61,8 @@ estimated."""
 _MIN_DELAY_S = 0.004  # a shorter time between the two images of a pair is not reported as a delay
 _MIN_DELAY_EFFECT_PX = 0.7
 """A delay is not reported if the standard deviation of the row offsets that it causes is not above this."""
-_MIN_EXPLAINED_VARIANCE = 0.3  # share of the variance of row offsets that a reported delay must explain
+# A delay is not reported unless it explains more than this share of the variance of row offsets.
+_MIN_EXPLAINED_VARIANCE = 0.3
 _FAST_PX_S = 15.0
 """A feature that moves up or down in the image faster than this is fast: a delay shows in it."""
 _MAX_RESIDUAL_PX = 2.0  # a match whose row offset differs by more from that of the delay is an outlier

@@ -13,13 +13,13 @@ from rse_pf.geometry.transforms import Array
 
 __all__ = ["Camera"]
 
-# Largest width or height of an image in pixels: no sensor of a robot is larger; a larger number has another
-# unit.
+# Largest width or height of an image in pixels: no sensor of a robot is larger; a larger number is refused.
 MAX_IMAGE_SIDE_PX = 16384
-# Smallest focal length, as a multiple of the longer side of the image: a smaller one is in another unit, such
-# as millimetres.
+# Smallest focal length, as a multiple of the longer side of the image: a smaller one is refused, because it
+# is in another unit, such as millimetres.
 MIN_FOCAL_LENGTH = 0.05
-# Largest focal length, as a multiple of the longer side of the image: no robot carries such a telescope.
+# Largest focal length, as a multiple of the longer side of the image: a larger one is refused, because no
+# robot carries such a telescope.
 MAX_FOCAL_LENGTH = 100.0
 
 

@@ -31,7 +31,7 @@ number of dimensions, twice the scalar product and the sum of the squared length
 which float32 holds whole numbers exactly, so that a distance does not depend on the order of summation."""
 _MIN_DESCRIPTOR_SIZE = 4
 """Smallest size of a descriptor, in bytes if it is binary, else in dimensions: smaller ones do not
-distinguish features."""
+distinguish features, and are refused."""
 _KIND_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
 
 

@@ -69,17 +69,21 @@ compress to half their size only, so that a file with a larger ratio is hostile,
 _UNCHECKED_BYTES = 1 << 20
 """Decompressed size in bytes up to which a map file may have any compression ratio: 1 MiB of memory harms
 nobody."""
-_MAX_ID = 2**63 - 1  # the largest id of a keyframe: an int64
-_MAX_NAME_LENGTH = 64  # largest number of characters of the name of a keyframe's robot
+_MAX_ID = 2**63 - 1  # the largest id of a keyframe, an int64; a keyframe with a larger one is refused
+# Largest number of characters of the name of a keyframe's robot; a keyframe with a longer one is refused.
+_MAX_NAME_LENGTH = 64
 _MAX_COORDINATE_M = 1e9
 """Largest absolute coordinate in metres of a point in a map, beyond any map; far larger ones would overflow
 float32 when they are squared."""
 _MAX_TIME_S = 1e12
 """Largest absolute time of a keyframe in Unix seconds: far beyond any clock, and float64 still resolves
 0.2 ms."""
-_MAX_PIXEL = 1e5  # largest absolute coordinate of a feature in pixels: no camera has wider images
+# Largest absolute coordinate of a feature in pixels, since no camera has wider images; a keyframe with a
+# larger one is refused.
+_MAX_PIXEL = 1e5
 _MAX_INFORMATION = 1e18
-"""Largest absolute number in the information matrix of an edge: a standard deviation of 1 nm or 1 nrad."""
+"""Largest absolute number in the information matrix of an edge, a standard deviation of 1 nm or 1 nrad; an
+edge with a larger one is refused."""
 _ITEM_VALUES = {"keyframes": 100, "edges": 40}
 """Largest average number of MessagePack values (keys, numbers, strings and byte strings) of the keyframes of
 a map file, and of its edges: more than they have in this release, so that a later release can add fields.  A

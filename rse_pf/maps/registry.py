@@ -264,7 +264,7 @@ class MapRegistry:
     ) -> MapRecord:
         digest, parent = content.digest, origin.parent
         base = self._base(name)
-        # 1. Check that the head is the parent, and make the record.
+        # 1. Refuse the commit unless the head is the stated parent, and make the record.
         if self._head(name) != parent:
             raise _head_moved(name)
         parent_record = self.record(name, parent) if parent is not None else None

@@ -111,7 +111,7 @@ def _opencv_engine() -> Engine:
             if has_global:
                 rotation, translation = global_rotation, global_translation
             # 3. Refine the pose over its inliers by Levenberg-Marquardt, and find the inliers of the refined
-            # pose among all rows; repeat this until the inliers stay the same.
+            # pose among all rows; repeat this until the inliers stay the same, or `_MAX_REFINEMENTS` times.
             for _ in range(_MAX_REFINEMENTS):
                 rotation, translation = cv2.solvePnPRefineLM(
                     points_world[rows], pixels[rows], matrix, None, rotation, translation

@@ -13,8 +13,8 @@ from rse_pf.errors import BadRequest
 __all__ = ["MIN_CORRESPONDENCES", "PnpOptions", "WeakLimits", "require_within"]
 
 MIN_CORRESPONDENCES = 4
-"""Fewest correspondences of a pose: three have up to four poses (P3P), and a fourth one decides between
-them."""
+"""Fewest correspondences of a pose, fewer are refused: three have up to four poses (P3P), and a fourth one
+decides between them."""
 
 
 def require_within(name: str, value: float, low: float, high: float) -> None:

@@ -16,10 +16,10 @@ __all__ = ["deform_cloud", "deform_clouds", "find_observers", "merge_clouds", "v
 
 _VOXEL_M = 0.01  # edge in metres of the voxels to which a merged cloud is thinned
 _MIN_DEPTH_M = 0.2
-"""Smallest depth in metres at which a keyframe can have observed a point of the cloud: that of a depth
+"""Smallest depth in metres at which a keyframe counts as an observer of a point of the cloud: that of a depth
 camera."""
 _MAX_DEPTH_M = 6.0
-"""Largest depth in metres at which a keyframe can have observed a point of the cloud: that of a depth
+"""Largest depth in metres at which a keyframe counts as an observer of a point of the cloud: that of a depth
 camera."""
 _UNOBSERVED_COST = 1e3
 """Metres that are added to the distance of a point from a keyframe that does not see it, so that every

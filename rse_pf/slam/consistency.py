@@ -214,7 +214,8 @@ def are_pairwise_consistent(
     reference_m2, reference_rad2 = reference.mean_variances
     variance_rad2 = variance_rad2 + reference_rad2 + steps * math.radians(noise.step_deg) ** 2
     variance_m2 = variance_m2 + reference_m2 + steps * noise.step_m**2 + variance_rad2 * lever_m2
-    # 5. Test translation, rotation and scale against the chi-squared distribution.
+    # 5. Test translation and rotation against the chi-squared distribution; where units of length differ, add
+    #    the variance of the scale, and test the scales, too.
     if edges.scales is None:
         return _are_twists_noise(trip, variance_m2, variance_rad2)
     variance_m2 = variance_m2 + mean_scale_variance * (along_b[:, :3, 3] ** 2).sum(axis=1)

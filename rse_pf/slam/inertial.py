@@ -47,12 +47,13 @@ _MAX_GRAVITY_DEVIATION_RAD = 0.35
 """Largest accepted standard deviation in radians of a direction of gravity: beyond 20 degrees it is useless.
 An IMU block with a larger one is refused."""
 # `decode_imu` refuses a block with a number beyond one of the following limits.
-_MAX_ROTATION_RAD = 3.2  # largest length of a rotation vector in radians: pi, and room for rounding
-_MAX_DURATION_S = 60.0  # longest preintegrated motion in seconds: an IMU drifts too far in a longer time
-_MAX_VELOCITY_M_S = 1e3  # largest coordinate of the velocity of a preintegrated motion in m/s
-_MAX_POSITION_M = 1e4  # largest coordinate of the position of a preintegrated motion in metres
-_MAX_LEVER_ARM_M = 10.0  # largest distance in metres of the IMU from the camera on one robot
-_MAX_BIAS = 10.0  # largest bias of a gyroscope in rad/s, or of an accelerometer in m/s^2
+_MAX_ROTATION_RAD = 3.2  # largest accepted length of a rotation vector in radians: pi, and room for rounding
+# Longest accepted preintegrated motion in seconds: an IMU drifts too far in a longer time.
+_MAX_DURATION_S = 60.0
+_MAX_VELOCITY_M_S = 1e3  # largest accepted coordinate of the velocity of a preintegrated motion in m/s
+_MAX_POSITION_M = 1e4  # largest accepted coordinate of the position of a preintegrated motion in metres
+_MAX_LEVER_ARM_M = 10.0  # largest accepted distance in metres of the IMU from the camera on one robot
+_MAX_BIAS = 10.0  # largest accepted bias of a gyroscope in rad/s, or of an accelerometer in m/s^2
 _MAX_MOTION_DEVIATION = 1e3
 """Largest standard deviation of a preintegrated rotation (rad), velocity (m/s) or position (m): above it, the
 motion says nothing, and its block is refused."""

@@ -117,7 +117,7 @@ _FEATURE_BYTES = 6
 """Encoded size in bytes of a feature without its descriptor: column, row and depth, 2 bytes each."""
 _MAX_FEATURES_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)
 """Largest encoded size in bytes of all features of one keyframe, whatever their kind: that of 894 ORB
-features."""
+features.  `max_features` divides it by the size of one feature."""
 _FINEST_PIXEL_FRACTION = 4
 """Exponent of the finest unit of encoded pixels: 2**-4 px, where no coordinate is above 4,095 px."""
 _COARSEST_PIXEL_FRACTION = 2
@@ -128,19 +128,30 @@ keyframe with a farther one is refused.  Beyond the left or the upper edge a coo
 which the encoding does not hold."""
 _DISPARITY_STEPS_PER_PX = 64  # disparities are encoded in units of 1/64 px
 _MAX_STEPS = 65_535  # largest number that encodes a depth or a disparity: a uint16
-_MIN_DEPTH_MM = 10  # smallest depth of a depth camera that is encoded, in millimetres
-_MIN_DEPTH_M = 0.01  # smallest depth of a stereo pair that is encoded, in metres
+# Smallest depth of a depth camera in millimetres: a feature with a smaller one is not encoded, and a keyframe
+# that holds one is refused.
+_MIN_DEPTH_MM = 10
+# Smallest depth of a stereo pair in metres: a feature with a smaller one is not encoded, and a keyframe that
+# holds one is refused.
+_MIN_DEPTH_M = 0.01
 _MAX_DEPTH_M = 1000.0
-"""Largest depth of a stereo pair that is encoded, in metres: poses are refined with depths up to 1 km."""
-_MIN_F_BASELINE = 0.05  # smallest focal length times baseline of a stereo pair, in px m: 50 px and 1 mm
-_MAX_F_BASELINE = 1e5  # largest focal length times baseline of a stereo pair, in px m: 10,000 px and 10 m
+"""Largest depth of a stereo pair in metres: a feature with a larger one is not encoded, and a keyframe that
+holds one is refused, since poses are refined with depths up to 1 km."""
+# Smallest focal length times baseline of a stereo pair in px m, such as 50 px and 1 mm; a keyframe with a
+# smaller one is refused.
+_MIN_F_BASELINE = 0.05
+# Largest focal length times baseline of a stereo pair in px m, such as 10,000 px and 10 m; a keyframe with a
+# larger one is refused.
+_MAX_F_BASELINE = 1e5
 _MAX_MEDIAN_DEPTHS = 16.0
 """A depth without metric scale is encoded as unknown if it is more than this multiple of the median depth of
 its keyframe: the position of such a far landmark is inaccurate."""
 _MIN_UNIT = 1e-9
-"""Smallest quantisation step of depths without metric scale, in the unit of length of their segment."""
+"""Smallest accepted quantisation step of depths without metric scale, in the unit of length of their
+segment."""
 _MAX_UNIT = 1e3
-"""Largest quantisation step of depths without metric scale, in the unit of length of their segment."""
+"""Largest accepted quantisation step of depths without metric scale, in the unit of length of their
+segment."""
 _MAX_TIME_S = 1e12
 """Largest time of a keyframe in seconds after or before 1970, far beyond any clock: a keyframe with another
 time is refused."""
@@ -508,7 +519,7 @@ def decode_keyframe(data: bytes) -> SentKeyframe:
             finite or out of its range, or a feature lies more than 64 px outside the image.
         InvalidCamera: The intrinsics are not those of a camera.
     """
-    # 1. Read the head.
+    # 1. Check the size of the bytes, and decode the head.
     if not _HEAD_STRUCT.size <= len(data) <= MAX_KEYFRAME_BYTES:
         raise _bad_keyframe(
             f"its size of {len(data)} bytes is not within {_HEAD_STRUCT.size}..{MAX_KEYFRAME_BYTES}"
@@ -539,7 +550,7 @@ def decode_keyframe(data: bytes) -> SentKeyframe:
     # 3. Decode the required blocks.
     camera = _decode_camera(data, *spans[_CAMERA_BLOCK])
     features = _decode_features(data, spans[_FEATURES_BLOCK], spans[_GEOMETRY_BLOCK], camera)
-    # 4. Decode the optional blocks.
+    # 4. Decode those optional blocks that the keyframe has.
     if _NOISE_BLOCK in spans:
         if not features.is_metric:
             raise _bad_keyframe("it has a noise in metres, and depths without scale", "leave the noise out")
@@ -646,7 +657,7 @@ def _decode_features(
         camera: The camera, whose image must contain the pixels up to a border of 64 px.
     """
     (begin, end), (geometry_begin, geometry_end) = features_span, geometry_span
-    # 1. Check the sizes by the head of the features block.
+    # 1. Check that both blocks have the sizes that the head of the features block states.
     if end - begin < _FEATURES_STRUCT.size or geometry_end - geometry_begin < _GEOMETRY_STRUCT.size:
         raise _bad_keyframe("the block of the features or of the geometry is too short")
     detector, distance, descriptor_bytes, n, fraction, name_bytes = _FEATURES_STRUCT.unpack_from(data, begin)

@@ -44,16 +44,16 @@ MAX_POINTS_BYTES = 160_000
 """Largest size in bytes of the object with the coloured points of one keyframe.  16,000 points have 144,008
 bytes without compression (8 of the head, 9 for each point), so that the limit refuses no valid object."""
 MAX_OBJECT_BYTES = 1 << 20
-"""Largest size in bytes of an object to which a keyframe may refer, its image or its coloured points: 1
-MiB."""
+"""Largest size in bytes of an object to which a keyframe may refer, its image or its coloured points: 1 MiB.
+A reference that states more is refused."""
 _HEAD_STRUCT = struct.Struct("<2sBBI")
 _REFERENCE_STRUCT = struct.Struct("<32sI")
 REFERENCE_BYTES = _REFERENCE_STRUCT.size  # size in bytes of an encoded reference to an object
 _MAGIC = b"KP"  # the first two bytes of the points of a keyframe
 _VERSION = 1  # version of the encoding of coloured points, the only one that is read and written
 _POINT_BYTES = 9  # size in bytes of an uncompressed point: index 4, depth 2, colour 3
-_MIN_DEPTH_MM = 10  # smallest depth in millimetres of a coloured point
-_MAX_DEPTH_MM = 65_535  # largest depth in millimetres of a coloured point: a uint16
+_MIN_DEPTH_MM = 10  # smallest depth in millimetres of a coloured point; a nearer one is not encoded
+_MAX_DEPTH_MM = 65_535  # largest depth in millimetres that a uint16 holds; a farther point is not encoded
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 

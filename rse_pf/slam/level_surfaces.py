@@ -26,8 +26,8 @@ _VOXEL_M = 0.15  # edge in metres of the voxels in which surface normals are est
 _MAX_POINTS = 500_000
 """Number of points from twice which on a cloud is thinned evenly before level surfaces are looked for, which
 bounds the time; at least this number and fewer than twice as many points are left."""
-_MIN_VOXEL_POINTS = 12  # smallest number of points of a voxel from which a surface normal is estimated
-_MIN_VOXELS = 20  # smallest number of flat voxels with similar normals that count as level surfaces
+_MIN_VOXEL_POINTS = 12  # a voxel with fewer points has no surface normal
+_MIN_VOXELS = 20  # with fewer flat voxels of similar normals, a cloud has no level surfaces
 _MAX_FLATNESS_RATIO = 0.02
 """A voxel is flat if the smallest variance of its points along a principal axis, that of the normal, is at
 most this share of the second smallest one."""
@@ -47,7 +47,7 @@ used."""
 _MIN_CELL_POINTS = 10
 """Smallest number of points of a cell of the floor; a cell with fewer is left out, because its low point may
 be an outlier."""
-_MIN_CELLS = 40  # smallest number of cells that must lie on the plane of the floor
+_MIN_CELLS = 40  # with fewer cells on the plane of the floor, a cloud has no floor
 _TUKEY_LIMITS_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Distances in metres from the plane of the floor at which the weight of a cell becomes 0, for the successive
 iterations of its robust fit."""

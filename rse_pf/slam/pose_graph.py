@@ -27,7 +27,9 @@ __all__ = [
 ]
 
 _UPPER = np.triu_indices(6)
-_MAX_ID = 2**53  # largest absolute id of a vertex in g2o text: JSON and float64 hold it exactly
+# Largest absolute id of a vertex in g2o text, which JSON and float64 hold exactly; a text with a larger one
+# is refused.
+_MAX_ID = 2**53
 # Largest absolute coordinate of a pose in metres, beyond any map; a graph with a larger one is refused.
 _MAX_COORDINATE_M = 1e9
 # Largest absolute number of an information matrix, a standard deviation of 1 nm or 1 nrad; a graph with a

@@ -294,7 +294,8 @@ def adjust_with_calibration(
                 break
             is_converged = cost - next_cost < _CONVERGED_SHARE * cost
             state, cost, damping = next_state, next_cost, max(damping * 0.1, _MIN_DAMPING)
-            # 2. Estimate the noise again at fixed steps, so that the weights of outliers fit.
+            # 2. After some steps, estimate the noise again from the residuals, which corrects the weights of
+            #    outliers; after other steps, end if the adjustment has converged.
             if iteration in _RESCALE_ITERATIONS:
                 system.estimate_noise(state)
                 cost = system.cost(state)

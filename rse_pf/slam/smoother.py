@@ -155,7 +155,7 @@ def smooth(
             step, scale_step = _STEP_REDUCTION * step, _STEP_REDUCTION * scale_step
         else:
             break
-        # 5. Take the step, and stop after convergence.
+        # 5. Take the step, and end if it has lowered the cost, or moved the poses, by little.
         has_small_decrease = cost - new_cost <= _MIN_RELATIVE_DECREASE * cost
         T, T_a_b_now, error, squares, cost = new_T, new_T_a_b, new_error, new_squares, new_cost
         T_b_a_measured, log_scales = new_measured, log_scales + scale_step
