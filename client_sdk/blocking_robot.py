@@ -167,7 +167,7 @@ class BlockingRobot(AutoClose):
 
 
 class BlockingMapper:
-    """Wrap a `Mapper` for programs without asyncio; properties that are not here are read from ``mapper``."""
+    """Wrap a `Mapper` for programs without asyncio; its attribute ``mapper`` has all other properties."""
 
     def __init__(self, mapper: Mapper, wait: Callable[[Coroutine[Any, Any, Any]], Any] = asyncio.run) -> None:
         """Wrap a mapper.

@@ -55,16 +55,16 @@ __all__ = [
 ]
 
 _MAX_FOUND_FEATURES = 100_000
-"""Largest number of features that a user's extractor may return for one image; with more, which would
-take too much time and memory, a UsageError is raised."""
+"""Largest number of features that a user's extractor may return for one image; with more, which would take
+too much time and memory, a UsageError is raised."""
 _MOTION_HISTORY_POSES = 10
 """Largest number of poses that a user's motion model is given, the newest ones; older poses are dropped."""
 _MIN_PLACE_SIZE = 8
-"""Smallest length of the vector that a user's place recogniser returns; a shorter one, which would
-not distinguish places, raises a UsageError."""
+"""Smallest length of the vector that a user's place recogniser returns; a shorter one, which would not
+distinguish places, raises a UsageError."""
 _MAX_PLACE_SIZE = 4096
-"""Largest length of the vector that a user's place recogniser returns; a longer one, which would
-take too much memory for each keyframe, raises a UsageError."""
+"""Largest length of the vector that a user's place recogniser returns; a longer one, which would take too
+much memory for each keyframe, raises a UsageError."""
 _CLIP_RMS = 4.0
 """When a float descriptor becomes int8, its numbers are clipped at this many times their root mean square;
 the limit becomes 127."""
@@ -357,7 +357,7 @@ def _call_user(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """
     try:
         return function(*arguments)
-    except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a task or a thread
+    except (Exception, asyncio.CancelledError, SystemExit) as error:  # also those that end a task or a thread
         raise UsageError(
             f"the {name} failed: {type(error).__name__}: {_describe_error(error)}",
             hint="call the function without a mapper to find the cause, or see docs/own_parts.md",
@@ -459,7 +459,7 @@ class Plugins:
         return T_last_next
 
     def add_pose(self, timestamp_s: float, T_world_camera: Array) -> None:
-        """Give the pose of a tracked frame to the user's motion model."""
+        """Store the pose of a tracked frame, from which the user's motion model predicts later poses."""
         if self.motion is not None:
             self.motion.add(timestamp_s, T_world_camera)
 

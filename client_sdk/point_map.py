@@ -31,8 +31,8 @@ _MAX_VOXEL_INDEX = 1 << 20
 three indices make one int64 key."""
 _FIRST_VOXELS = 2048  # voxels for which a new map has memory; the memory doubles when they are full
 _FIRST_SLOTS = 4096  # slots of a new hash table, at least twice as many as voxels
-_MIN_VOXEL_M = 0.001  # smallest edge of a voxel: no depth sensor is more exact
-_MAX_VOXEL_M = 1.0  # largest edge of a voxel: a larger one is probably in millimetres
+_MIN_VOXEL_M = 0.001  # a smaller edge of a voxel is refused: no depth sensor is more exact
+_MAX_VOXEL_M = 1.0  # a larger edge of a voxel is refused: it is probably stated in millimetres
 _NO_POINTS = np.empty((0, 3)), np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int32)
 """Points, colours and weights for a call of the native core that adds no points."""
 

@@ -63,8 +63,8 @@ MAX_DEADLINE_S = 3600.0
 longer one raises a UsageError."""
 
 STORE_TIMEOUT_S = 5.0
-"""Longest time for which one request of `Robot.store_object` waits for data, in seconds; the caller repeats
-what failed."""
+"""Longest time for which a request of `Robot.store_object` waits for the next bytes of its answer, in
+seconds.  A request that fails is not repeated here, but by the caller."""
 
 
 class Robot:

@@ -15,7 +15,7 @@ from rse_pf.geometry import Array, body_poses, exp_se3, from_quaternion, inverse
 __all__ = ["Trajectory", "read_trajectory", "write_trajectory"]
 
 _BODY_SUFFIX = "-body"
-"""Suffix of the file name of a body's trajectory: ``trajectory-body.txt`` beside a camera's
+"""Suffix of the file name of a body's trajectory: ``trajectory-body.txt``, written next to the camera's
 ``trajectory.txt``."""
 _MAX_FILE_BYTES = 256 << 20  # a larger trajectory file is refused; this one has about 3 million poses
 _MIN_STEP_S = 1e-9  # time between two poses with equal stamps in an interpolation, to avoid a division by 0

@@ -18,10 +18,10 @@ from rse_pf.geometry import Array
 
 __all__ = ["Board", "find_corners", "write_board"]
 
-_MIN_CORNERS = 3  # fewest inner corners of a board in a row or column: OpenCV needs three
-_MAX_CORNERS = (
-    40  # most inner corners of a board in a row or column: more are too close to each other in an image
-)
+_MIN_CORNERS = 3  # a board with fewer inner corners in a row or column is refused: OpenCV needs three
+_MAX_CORNERS = 40
+"""A board with more inner corners in a row or column is refused: they are too close to each other in an
+image."""
 _MIN_SQUARE_M = 0.001  # a smaller side of a square is refused: the user has stated metres as millimetres
 _MAX_SQUARE_M = 1.0  # a larger side of a square is refused: the stated number is probably not in millimetres
 _MM_PER_POINT = 25.4 / 72.0  # millimetres in a point, the unit of PDF

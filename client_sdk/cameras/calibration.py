@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, Camera
 
 __all__ = ["BoardViews", "calibrate"]
 
-MIN_VIEWS = 8  # fewest views of the board for a calibration, of one camera or of a stereo pair
+MIN_VIEWS = 8  # a calibration of one camera or of a stereo pair with fewer views of the board is refused
 _MAX_FOCAL_DEVIATION_PERCENT = 2.0
 """Largest standard deviation of the focal length, in percent of it, of a calibration that is not refused:
 with a larger one the views are too similar."""

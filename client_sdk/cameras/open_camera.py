@@ -37,7 +37,7 @@ from rse_pf.geometry import Camera
 
 __all__ = ["is_recording", "open_camera", "source_of_frames"]
 
-_BAG_ENDINGS = {".bag", ".mcap", ".db3"}  # files that `client_sdk.bags` reads
+_BAG_ENDINGS = {".bag", ".mcap", ".db3"}  # files that `client_sdk.bags` reads, and `open_camera` refuses
 _REALSENSE = "realsense"  # name of a source that is a device, and not a file
 _SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
 
@@ -138,7 +138,8 @@ def open_camera(
             log=dataset.log,
             span_s=dataset.span_s,
         )
-    # 4. Open the devices or videos of a stereo rig.
+    # 4. With a rig of two cameras, refuse a folder, which has no two folders of images; open devices or
+    #    videos.
     if isinstance(own, Rig) and path.is_dir():
         raise UsageError(
             f"{word} has no two folders of images, such as left/ and right/ or image_left/ and image_right/",
@@ -146,7 +147,7 @@ def open_camera(
         )
     if isinstance(own, Rig):
         return _open_stereo_video(word, own, rate_hz, camera, stated_by)
-    # 5. Open one camera: a folder, a video or a device.
+    # 5. Refuse a single camera where a pair is required, else open it: a folder, a video or a device.
     if camera == "stereo":
         raise UsageError(
             f"{word} is one camera, and a stereo pair was asked for", hint="name a rig: --intrinsics rig.json"

@@ -20,7 +20,7 @@ __all__ = ["open_realsense"]
 
 _SIZE = (640, 480)  # width and height in px to which the camera is set
 _RATE_HZ = 30  # images per second to which the camera is set
-_TIMEOUT_MS = 5000  # a camera that has given no image for this long counts as disconnected
+_TIMEOUT_MS = 5000  # a camera that has given no image for this long is an error, as if it were disconnected
 _CABLE_HINT = "check the cable: USB 3 is needed"
 
 

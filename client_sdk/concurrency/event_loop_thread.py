@@ -80,7 +80,7 @@ class EventLoopThread:
         except concurrent.futures.CancelledError:
             raise _not_connected_error() from None
         except concurrent.futures.TimeoutError:
-            if future.done():  # *work* itself raised this error
+            if future.done():  # *work* itself raised this TimeoutError
                 raise
             raise Expired(
                 f"no answer within {limit_s:g} s, which is deadline_s and a little more",

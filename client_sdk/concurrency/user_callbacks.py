@@ -155,7 +155,7 @@ class UserCallbacks:
         if self._count((name, type(error).__name__, source_line)):
             if isinstance(error, RsePfError):
                 cause = error.message
-            else:  # str(error) may raise
+            else:  # `str(error)` may raise; `format_exception_only` does not
                 text = "".join(traceback.format_exception_only(type(error), error))
                 cause = " ".join(text.partition(": ")[2].split())
             _log_error(
@@ -243,7 +243,7 @@ async def _await_token(function: Callable[[], Awaitable[str]]) -> Any:
                 hint="pass an async function, such as read_enrolment(FILE).token",
             )
         return await token
-    except (SystemExit, KeyboardInterrupt) as error:  # as they are, they would end the event loop
+    except (SystemExit, KeyboardInterrupt) as error:  # they would end the event loop
         if _is_interrupt(error):
             raise
         raise RuntimeError(f"{TOKEN_FUNCTION} raised {type(error).__name__}") from error

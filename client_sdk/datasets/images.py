@@ -37,7 +37,8 @@ _Row = TypeVar("_Row")
 _Result = TypeVar("_Result")
 _IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
 _WHOLE_NUMBER = re.compile(r"\d+")  # in the name of a file
-_NO_READING = 65535  # value with which some recorders mark a pixel without a reading in a 16-bit depth image
+_NO_READING = 65535
+"""Value with which some recorders mark a pixel without a reading in a 16-bit depth image; it is read as 0."""
 _WHITE_PERCENTILE = 99.9
 """The values of a 16-bit image are scaled so that this percentile of them becomes 255; the brighter pixels,
 also 255 then, are mostly defects of the sensor.  Each image is scaled by itself."""

@@ -49,10 +49,11 @@ __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 _MAX_LIST_BYTES = 64 << 20  # a longer list of images is refused; this is enough for a million images
 _MAX_STAMP_DIFFERENCE_S = 0.02
 """Largest time between the colour and the depth image of a frame of a TUM folder, as in TUM's
-``associate.py``."""
+``associate.py``; a colour image without such a depth image is left out."""
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
 """Largest time between the colour and the depth image of a frame of a raw dump of NYU Depth V2: one period at
-the lowest rate of its two streams, which are not synchronised and have 20 to 30 images per second."""
+the lowest rate of its two streams, which are not synchronised and have 20 to 30 images per second.  A depth
+image without such a colour image is left out."""
 _FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -214,7 +215,8 @@ def _open_tum(folder: Path, named_intrinsics: Path | None) -> Dataset:
         lambda: probe_size_px([folder / image for image in colours.images]),
         has_depth=depths is not None,
     )
-    # 2. Pair each colour image with the depth image that is nearest in time; without depth, use all of them.
+    # 2. Pair each colour image with the depth image that is nearest in time, and leave out those without one;
+    #    in a folder without depth images, use all colour images.
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)

@@ -307,7 +307,7 @@ def _make_dataset(
         UsageError: There is no image, the cameras are no stereo pair, or facts contradict each other.
         MissingExtra: OpenCV is not installed.
     """
-    # 1. Prepare the undistortion or rectification, with which a frame is read later.
+    # 1. Refuse a recording without images; prepare the undistortion or rectification of frames.
     if not len(lefts):
         raise UsageError(f"{name} has no images", hint="unpack the recording again")
     left, right = rig.left, rig.right

@@ -16,7 +16,7 @@ _SAME_RATE_RATIO = 1.05
 Hz have 29.97 or 30.2 Hz, and must not lose frames when 30 Hz are wanted."""
 _INTERVAL_WINDOW = 31
 """The frame interval of a live camera is the median interval of this many latest time stamps."""
-_ROUNDING_S = 1e-6  # largest error, in seconds, of time stamps and periods that are rounded decimal fractions
+_ROUNDING_S = 1e-6  # tolerance, in seconds, of comparisons of times, which are rounded decimal fractions
 
 
 class Thinning:

@@ -28,7 +28,7 @@ from rse_pf.wire.live_map import AlignmentUpdate, MapUpdate, PoseUpdate, Relocal
 
 __all__ = ["AlignedBy", "Alignments", "Correction", "CorrectionStream", "OtherRobot", "SegmentAlignment"]
 
-_NO_ANSWER = "the map has not answered yet"  # reason of a segment before an update of the map names it
+_NO_ANSWER = "the map has not answered yet"  # why a segment is not aligned until an update names the segment
 _UPPER_TRIANGLE = np.triu_indices(6)
 """Rows and columns, in this order, of the 21 numbers by which a message states a 6x6 covariance."""
 _MAX_CORRECTIONS = 1000

@@ -257,7 +257,7 @@ class BackgroundUploader:
             try:
                 await self._store(data)
             except Exception as error:  # noqa: BLE001  the function may belong to the user's program
-                # 3. After a failure, drop refused objects, and pause before the next upload.
+                # 3. Record the failure, also one of a user's function; drop a refused object, and pause.
                 if not isinstance(error, RsePfError):
                     self._callbacks.report("store", error)
                     error = InternalError(
@@ -331,7 +331,7 @@ def _choose_grid_pixels(frame: Frame, max_points: int) -> _Pixels:
 
 
 def _encode_jpeg(frame: Frame) -> bytes | None:
-    """Encode the image of a frame as JPEG; return None if that fails, or is above `MAX_SINGLE_PUT_BYTES`."""
+    """Encode the image of a frame as JPEG; return None on failure, or above `MAX_SINGLE_PUT_BYTES`."""
     cv2 = load_opencv()
     bgr = np.ascontiguousarray(frame.rgb[:, :, ::-1])
     is_encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])

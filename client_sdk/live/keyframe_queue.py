@@ -28,8 +28,12 @@ __all__ = ["KeyframeQueue", "NumberOffset", "QueuedKeyframe", "choose_number_off
 _KEYFRAME_SUFFIX = ".keyframe"
 _STATE_FILE = "state.json"
 _LOCK_FILE = ".lock"
-_MAX_MEMORY_BYTES = 64 << 20  # encoded keyframes that may wait in memory: about 2,000 keyframes of 34 kB
-_MAX_FOLDER_BYTES = 1 << 30  # encoded keyframes that may wait in a folder: about 30,000 keyframes of 34 kB
+_MAX_MEMORY_BYTES = 64 << 20
+"""Most bytes of the keyframes that wait in memory, about 2,000 keyframes of 34 kB; `KeyframeQueue.add`
+refuses further ones."""
+_MAX_FOLDER_BYTES = 1 << 30
+"""Most bytes of the keyframes that wait in a folder, about 30,000 keyframes of 34 kB; `KeyframeQueue.add`
+refuses further ones."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -626,12 +626,12 @@ class LiveMapper:
             self._sender.has_no_pose_query.set()
 
     async def _wait_quiet(self) -> None:
-        """Wait until no keyframe is queued and no pose query is open."""
+        """Wait until no keyframe is queued, then until no pose query is open."""
         await self._sender.is_empty.wait()
         await self._sender.has_no_pose_query.wait()
 
     async def _wait_sent(self) -> None:
-        """Wait until the map has acknowledged every keyframe, and every attachment was uploaded."""
+        """Wait until no keyframe is queued, and every attachment was uploaded or dropped."""
         await self._sender.is_empty.wait()
         await self._attachments.wait_empty()
 

@@ -34,8 +34,8 @@ class LiveOptions:
             none.
         points_bytes_per_s: Rate limit of the uploads of points, in bytes per second.
         images: Whether the images of keyframes are sent, if the operator allows it (``live.images``).
-        images_bytes_per_s: Rate limit of the uploads of images, in bytes per second; a keyframe that would
-            exceed it is sent without an image.
+        images_bytes_per_s: Rate limit of the uploads of images, in bytes per second; while it is used up,
+            keyframes are sent without an image.
         segment_after: Number of lost frames since the last pose after which a new segment begins.  Only
             frames with enough features count, so a covered lens begins no segment.  Not used without depth.
         relocalise_s: Shortest time between two relocalisations of a segment that is not aligned, in seconds;

@@ -30,11 +30,11 @@ MAX_PAUSE_RATIO = 1.0 / 3.0
 """Once attempts have failed for more than three times ``reconnect_max_s``, a pause is at most this share of
 the time for which they have failed: after an outage of a minute a robot is back within 20 seconds."""
 UNANSWERED_MIN_S = 1.0
-"""Shortest time between the starts of two attempts that nobody answers.  It never grows, because such
-attempts load no server."""
+"""The time between the starts of two attempts that nobody answers is at least this many seconds; it does not
+grow with the number of attempts, because they load no server."""
 UNANSWERED_MAX_S = 1.25
-"""Longest time between the starts of two attempts that nobody answers; it differs from the shortest one so
-that robots of one site do not dial at the same moment."""
+"""The time between the starts of two attempts that nobody answers is random up to this many seconds, so that
+robots of one site do not dial at the same moment."""
 REVOCATION_JITTER_S = 0.5
 """After a revocation, a robot dials at a random time within this many seconds from the moment at which new
 bearer tokens are accepted, so that not all robots dial at once."""

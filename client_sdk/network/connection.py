@@ -302,14 +302,15 @@ class Connection:
         try:
             while running and not self._usable_sockets():
                 _, running = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-            # 2. Wait as long again for the other regions: one that needs longer is not the nearest.
+            # 2. Wait for the other regions as long again, at most 0.7 s: one that needs longer is not the
+            # nearest.
             if running:
                 others_s = min(OTHER_REGIONS_MAX_WAIT_S, self._clock() - began_s)
                 _, running = await asyncio.wait(running, timeout=others_s)
         except asyncio.CancelledError:
             await cancel_tasks(joins)
             raise
-        # 3. Keep the failures; attempts that still run go on in the background.
+        # 3. Store the failure of each region; attempts that still run go on in the background.
         for region, task in zip(self._regions, joins, strict=True):
             region.first_join = task if task in running else None
             region.last_failure = None if task in running else task.result()

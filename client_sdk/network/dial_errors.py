@@ -53,8 +53,8 @@ RENEWAL_HINT = (
 )
 """Hint for a token that is expired, revoked or wrong."""
 MAX_RETRY_AFTER_S = 300.0
-"""Longest wait that a robot accepts from the header Retry-After, so that a wrong answer cannot keep it
-away."""
+"""Longest wait that a robot accepts from the header Retry-After; a longer one is cut to this, so that a wrong
+answer cannot keep the robot away."""
 WRONG_ADDRESS_STATUSES = (400, 404, 405, 407, 410, 426)
 """HTTP statuses that every attempt gets until somebody changes the URL, the proxy, or the program there, so
 that a first connect raises its error at once."""

@@ -35,14 +35,15 @@ WEB_SCHEME = {"ws": "http", "wss": "https", "http": "http", "https": "https"}
 the name of the variable of a proxy (``ws:`` uses ``HTTP_PROXY``)."""
 CHECK_PORT = "check host and port of the URL: no RSE-PF server answers there"
 FOREIGN_STATUSES = (101, 301, 302, 303, 308, 407, 511)
-"""HTTP statuses that login pages and proxies send and the data service of the platform never sends; it
-redirects by 307 only."""
+"""HTTP statuses by which an answer is recognised as that of a login page or a proxy: the data service of the
+platform never sends them, and redirects by 307 only."""
 TLS_WANTED = re.compile(rb"https|\bssl\b|\btls\b", re.IGNORECASE)
 """Words by which a 400 of nginx, Apache or Go is recognised as their answer to plain HTTP at a TLS port."""
 NO_TLS_REASONS = ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH_TOO_LONG")
 """Reasons of OpenSSL for the failure of a TLS handshake with a peer that sent plain text."""
 MAX_SHOWN_TEXT = 200
-"""Longest text of another program that an error message shows, in characters: a banner or an address."""
+"""Longest text of another program, a banner or an address, that an error message shows, in characters; a
+longer text is cut."""
 TLS_RECORD_TYPES = range(0x14, 0x18)
 """First byte of a TLS record (RFC 8446, 5.1): change of cipher, alert, handshake, data."""
 TIME_ERRORS = (9, 10)
@@ -116,14 +117,15 @@ def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
     # 1. Recognise a wrong scheme in the URL.
     if status == 400 and TLS_WANTED.search(answer.body) and not _is_tls_address(address):
         return _explain_tls(address)
-    # 2. Recognise a 400 of an RSE-PF server that misses the headers which a proxy on the way removed.
+    # 2. If a proxy on the way removed headers, an RSE-PF server answers 400 ``bad-message``: explain this as
+    # 426.
     if status == 400 and refusal_in(answer.body, "bad-message") is not None:
         status = 426
     # 3. Look up the cause of a status that has one usual cause.
     if status in CAUSE_AND_HINT:
         cause, hint = CAUSE_AND_HINT[status]
         return ConnectError(f"{statement}{cause}", hint=hint)
-    # 4. Name redirects and pages, which a login page (captive portal) sends.
+    # 4. Report a redirect or a web page, as a login page (captive portal) sends it, with its address.
     if 300 <= status < 400:
         target = _redirect_target(address, answer)
         hint = f"open {target} in a web browser: log in there, or write its host and scheme in the URL"
@@ -152,7 +154,7 @@ def explain_no_answer(
         first_bytes: What the peer sent instead; empty if it sent nothing.
         within_s: How many seconds the attempt waited for the answer, None if unknown.
     """
-    # 1. Name the program that sent something else.
+    # 1. Report a peer that sent TLS, or the text of another program.
     if _is_tls_record(first_bytes):
         return _explain_tls(address)
     if first_bytes:

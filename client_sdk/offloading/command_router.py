@@ -30,7 +30,8 @@ OnProgress = Callable[[float, str], None]
 """Called with the share (0..1) of a long command that is computed, and the name of the last finished step."""
 
 PLACE_NAMES = {"server": "the cloud", "burst": "the burst function", "robot": "the robot"}
-"""For each place, its name in the ``why`` of the answer of a place that was asked after its failure."""
+"""For each place, its name in the field ``why`` of an answer that another place gave after this place had
+failed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
