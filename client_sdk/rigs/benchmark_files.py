@@ -161,7 +161,10 @@ def _word_after(text: str, field: str) -> str | None:
 
 
 def _list_after(text: str, heading: str, path: Path) -> list[float]:
-    """Return the numbers in the brackets after the pattern *heading*; empty if nothing matches it."""
+    """Return the numbers in the brackets after the pattern *heading* in *text*; empty if nothing matches it.
+
+    *path* is the file of the text, which errors name.
+    """
     match = re.search(rf"{heading}\s*\[([^\]]*)\]", text, re.MULTILINE)
     numbers: list[float] = read_numbers(path, match[1].replace(",", " ").split()).tolist() if match else []
     return numbers

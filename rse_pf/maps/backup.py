@@ -100,7 +100,7 @@ def write_backup(
 
 
 def _write_map(archive: tarfile.TarFile, maps: MapRegistry, name: str) -> tuple[str, set[str]]:
-    """Write a map; return the id of its head, and the ids of all versions that were written."""
+    """Write the map *name* to *archive*; return the ids of its head and of all versions that were written."""
     # 1. Write the version that is the head now before all others, so that the backup has it even if another
     #    process removes it while the others are written.
     head, data = _read_head(maps, name)

@@ -662,7 +662,7 @@ class MapRegistry:
             return None
 
     def _swap(self, name: str, expected: str | None, version: str) -> None:
-        """Set the head to *version* if it is *expected*; raises Conflict."""
+        """Set the head to the id *version* if the head is *expected* (None: no head), else raise Conflict."""
         expected_bytes = None if expected is None else expected.encode("ascii")
         try:
             self._store.compare_and_swap(f"{self._base(name)}head", expected_bytes, version.encode("ascii"))
@@ -670,7 +670,11 @@ class MapRegistry:
             raise _head_moved(name) from error
 
     def _complete_id(self, folder: str, prefix: str) -> str:
-        """Return the only id in *folder* that begins with *prefix*; raises NotFound."""
+        """Return the only id in *folder* that begins with *prefix*.
+
+        Raises:
+            NotFound: No id or more than one begins so, or *prefix* has fewer than six hexadecimal digits.
+        """
         if not re.fullmatch(r"[0-9a-f]{1,64}", prefix) or len(prefix) < _MIN_ID_DIGITS:
             raise NotFound(f"no version {prefix[:80]!r}", hint=f"give {_MIN_ID_DIGITS} or more hex digits")
         ids = [info.name.removeprefix(folder) for info in self._store.list(folder + prefix)]

@@ -101,8 +101,9 @@ def refine_with_depth(
         A copy of *solution* with the refined pose, its covariance, and the root mean square reprojection
         error of all inliers at the refined pose as ``rmse_px``; inliers, verdict and reason stay those of
         PnP.  *solution* itself if no inlier has a depth in the second image, if the ``rmse_px`` of the
-        refined pose would be above 1.5 times the larger one of ``solution.rmse_px`` and 0.2 px, or if the
-        normal equations are singular or leave a variance that is not positive and finite.
+        refined pose would be above 1.5 times the larger one of ``solution.rmse_px`` and 0.2 px, if the
+        iterations diverge, or if the normal equations are singular or leave a variance that is not positive
+        and finite.
 
     Raises:
         BadRequest: Shapes do not fit, a number is not finite or too large, a depth is negative, or a point is

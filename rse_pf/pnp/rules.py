@@ -2,9 +2,11 @@
 
 ``native/src/solve.hpp`` applies the rules; this module only lists them, for the replay of a recorded pose.
 A violated rule either refuses the pose or makes it weak.  The first violated rule that refuses determines the
-error.  Without such a rule, the reason of a weak pose is ``ambiguous`` if that rule is violated, else the
-first violated rule.  The core's test for mirrored points is not listed, because `Evidence` does not hold the
-number of inliers of the mirrored points.
+error, with one exception: where a rule ``no-consensus`` is violated, the error is ``degenerate`` if all 3-D
+points or all pixels are collinear, or if the inliers may be copies of each other.  Without a violated rule
+that refuses, the reason of a weak pose is ``ambiguous`` if that rule is violated, else the first violated
+rule.  The core's test for mirrored points is not listed, because `Evidence` does not hold the number of
+inliers of the mirrored points.
 """
 
 from __future__ import annotations
@@ -22,10 +24,11 @@ __all__ = ["Rule", "evaluate_rules"]
 # The constants of this block repeat constants of native/src/evidence.hpp and native/src/solve.hpp: change
 # them together.
 
-# Largest log10 of the expected number of random poses that fit as well as an accepted pose: 1e-5 poses.  A
-# pose above it is refused as ``no-consensus``.
+# Largest log10 of the expected number of random poses that fit as well as an accepted pose, 1e-5 poses; a
+# pose above it is refused.
 _MAX_LOG10_FALSE_ALARMS = -5.0
-# Width over length of the inlier pixels below which a pose is weak.
+# Width over length of the inlier pixels (`MIN_WIDTH_TO_LENGTH`) below which a pose is weak, as
+# ``nearly-collinear``.
 _WEAK_WIDTH_TO_LENGTH = 0.1
 # Smallest increase of the sum of squared reprojection errors from a pose to the second pose of a planar
 # scene, in units of the pixel variance, with which the pose is accepted: 3 standard deviations, squared.

@@ -204,7 +204,10 @@ class _Surfaces:
         self._tree, self._reach_m = tree, reach_m
 
     def measure_fit(self, T_target_source: Array) -> _Fit:
-        """Return the share of source points with a correspondence, and the mean point-to-plane distance."""
+        """Return the share of source points with a correspondence, and the mean point-to-plane distance.
+
+        A point without a correspondence counts as ``reach_m`` in the mean.
+        """
         has_match, distance, _, _ = self._correspondences(T_target_source)
         distance = np.where(has_match, distance, self._reach_m)
         return _Fit(float(has_match.mean()), float(distance.mean()))
@@ -248,7 +251,11 @@ class _Surfaces:
 def _rejection(
     initial: Array, pose: Array, before: _Fit, after: _Fit, constraint: float, options: IcpOptions
 ) -> str:
-    """Return the reason to reject a refined *pose*, "" if it is accepted."""
+    """Return the reason to reject a refined *pose* (`CloudAlignment.reason`), "" if it is accepted.
+
+    *before* and *after* are the fits at the *initial* and at the refined pose, and *constraint* is what
+    `_Surfaces.measure_constraint` returns for the refined pose.
+    """
     if after.overlap < options.min_overlap:
         return "little-overlap"
     if after.misfit_m > _MAX_MISFIT_SHARE * options.reach_m:

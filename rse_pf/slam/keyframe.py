@@ -496,7 +496,7 @@ def _encode_optional_blocks(keyframe: SentKeyframe) -> list[tuple[int, bytes]]:
 
 
 def _encode_geometry(features: KeyframeFeatures) -> tuple[bytes, bytes]:
-    """Return the head and the depths of the geometry block."""
+    """Return the bytes of the geometry block in two parts: those before the depths, and the depths."""
     depths, n = features.depths_m.astype(np.float64), len(features)
     if features.unit is not None:
         head = _GEOMETRY_STRUCT.pack(_SCALELESS_DEPTHS, 0, n) + _SCALE_STRUCT.pack(features.unit)
@@ -746,12 +746,12 @@ def _decode_depths(
 
 
 def _kind_numbers(kind: DescriptorKind) -> tuple[int, int, int]:
-    """Return detector, metric and bytes of a descriptor, as the features block states them."""
+    """Return the numbers of detector and distance, and the bytes of a descriptor, for the features block."""
     return (_ORB_DETECTOR if kind == ORB else _NAMED_DETECTOR), _DISTANCES[kind.dtype], kind.size
 
 
 def _decode_kind(detector: int, distance: int, size: int, name: bytes) -> DescriptorKind:
-    """Return the kind of descriptors that a features block states; raises BadRequest."""
+    """Return the kind of descriptors that a features block states; raises BadRequest if it is not known."""
     if (detector, distance, size, name) == (*_kind_numbers(ORB), b""):
         return ORB
     dtype = next((dtype for dtype, number in _DISTANCES.items() if number == distance), None)

@@ -165,7 +165,10 @@ def _make_factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) ->
 def _minimise(
     gtsam: Any, graph: PoseGraph, T_world_pose: Array, anchors: Rows, options: OptimiseOptions
 ) -> Array | None:
-    """Return the poses that Levenberg-Marquardt reaches from *T_world_pose*; None if it fails."""
+    """Return the poses that Levenberg-Marquardt reaches from *T_world_pose*; None if GTSAM raises an error.
+
+    The poses in the rows *anchors* stay fixed.
+    """
     values = gtsam.Values()
     for row, T in enumerate(T_world_pose):
         values.insert(row, gtsam.Pose3(T))

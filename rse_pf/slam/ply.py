@@ -90,7 +90,11 @@ def decode_ply(data: bytes) -> tuple[Points, Colours]:
 
 
 def _parse_header(header: bytes) -> tuple[int, np.dtype[np.void]]:
-    """Return the stated number of points, and the dtype of one point; raises BadRequest."""
+    """Return the stated number of points, and the dtype of one point.
+
+    Raises:
+        BadRequest: The header is not that of a file that `decode_ply` reads.
+    """
     lines = [
         line.split()
         for line in header.decode("ascii", "replace").splitlines()

@@ -264,7 +264,7 @@ def _join(values: Array) -> str:
 
 
 def _parse_pose(words: list[str]) -> Array:
-    """Return the pose of the seven numbers x y z qx qy qz qw; raises ValueError."""
+    """Return the pose of the seven numbers x y z qx qy qz qw; raises ValueError if they are no pose."""
     numbers = [float(word) for word in words]
     if len(numbers) != 7 or not all(abs(value) <= _MAX_COORDINATE_M for value in numbers):
         raise ValueError(f"a pose is x y z qx qy qz qw, each within +-{_MAX_COORDINATE_M:g}")

@@ -203,8 +203,8 @@ class FittedPose:
         T_camera_world: ``(4, 4)``, metres.
         information: ``(6, 6)``, inverse covariance of the pose's twist (metres, radians), applied on the left
             of ``T_camera_world``.
-        is_inlier: ``(n,)``, whether the squared distance of each observation from its prediction by this
-            pose, in variances, is at most the argument *gate2* of `fit_pose`.
+        is_inlier: ``(n,)``, whether each landmark lies more than 5 cm before the camera, and the squared
+            distance of its observation from the prediction, in variances, is below *gate2* of `fit_pose`.
     """
 
     T_camera_world: Array
@@ -661,8 +661,9 @@ def fit_pose(
             those without depth, which have two.
 
     Returns:
-        None where the observations do not determine the pose, and where any number of any observation is not
-        finite, or beyond its limit: 1e9 m for a point, 1e9 px for a pixel, 1 km for a depth.
+        None where the observations do not determine the pose, where the fit diverges, and where any number of
+        any observation is not finite, or beyond its limit: 1e9 m for a point, 1e9 px for a pixel, 1 km for a
+        depth, 0.001 to 1e6 px for the standard deviation of a pixel, and 1e-6 to 1000 m for that of a depth.
 
     Raises:
         BadRequest: Shapes do not fit.
