@@ -3,22 +3,25 @@
 The candidates are keyframes that place recognition proposes.  For each candidate, the pose of the view is
 estimated by PnP from matches of the candidate's landmarks, and refined with the depths of the view if it has
 metric ones.  Estimates that agree confirm each other.  An estimate elsewhere with many inliers makes the
-result ambiguous, because two parts of the world then look alike (perceptual aliasing).
+result ambiguous, because two parts of the world then look alike (perceptual aliasing).  A view without depths
+may be localised a second time with all landmarks around its first pose.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.slam.camera_fit import CameraFit, fit_camera
+from rse_pf.slam.guided_search import MapLandmarks, search_around
 from rse_pf.slam.relative_pose import (
     Landmarks,
     MeasuredPose,
@@ -28,7 +31,14 @@ from rse_pf.slam.relative_pose import (
     measure_scale_ratio,
 )
 
-__all__ = ["LocalisationCandidate", "LocalisationOptions", "Localised", "localise", "spread_candidates"]
+__all__ = [
+    "LocalisationCandidate",
+    "LocalisationOptions",
+    "Localised",
+    "is_in_region",
+    "localise",
+    "spread_candidates",
+]
 
 _MAX_LOG_FOCAL = 0.07
 """Largest absolute natural logarithm of the quotient of fitted and stated focal length at which the stated
@@ -42,6 +52,19 @@ accepted; photos with a right camera and a rolling shutter stay below 5.1 degree
 _MAX_MAP_COORDINATE_M = 1e6
 """Largest coordinate in metres of a candidate keyframe in the map.  A keyframe beyond it has a false pose,
 since no robot drives 1,000 km; it is ignored, so that it does not make the pose of the view ambiguous."""
+_CAMERA_WEIGHT = 0.25
+"""Factor of the covariance that unknown intrinsics add to that of a pose.  It is below 1 because most stated
+intrinsics are right: with 1, the errors of photos with a right camera are a fifth of the standard deviation.
+With 0.25, three standard deviations are still 1.5 times the shift that a wrong camera causes."""
+_GUIDED_FLOOR_M = 0.005
+"""Standard deviation along each axis, in metres, of the error that all landmarks around a pose have in
+common; its square is added to the variance of a guided search."""
+_GUIDED_FLOOR_DEG = 0.3
+"""Standard deviation about each axis, in degrees, of the error that all landmarks around a pose have in
+common; its square is added to the variance of a guided search."""
+_FEW_MATCHES = ("few-inliers", "low-inlier-ratio", "one-keyframe")
+"""Reasons that concern the matches of single keyframes; they do not hold for the pose of a guided search that
+is sure."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,15 +82,15 @@ class LocalisationOptions:
         rival_ratio: The pose is ambiguous if an estimate disagrees with the best one, is not weak by the
             rules of PnP, and has at least this share of the inliers of the best one.  In recordings of
             environments without repetition there was never such an estimate.
-        region_m: Largest distance between two candidates that count as of one region.
-        region_deg: Largest rotation between two candidates that count as of one region.
+        region_m: Largest distance between two keyframes that count as of one region.
+        region_deg: Largest rotation between two keyframes that count as of one region.
         max_per_region: Largest number of candidates of one region that are compared.
         has_equal_rooms: Whether the map may have rooms that look alike.  The verdict is then never ok, and
             the reason is "ambiguous": a view shows less than a room, and so cannot tell the rooms apart.
         fits_camera: Whether to fit a camera to the matches of a view without depths, because its stated
             intrinsics may be wrong, as those of a photo.  The verdict is then ok only if the fitted camera
-            has nearly the stated focal length and nearly the same pose, and the covariance includes the
-            difference of both poses.
+            has nearly the stated focal length and nearly the same pose, and the covariance includes a quarter
+            of the squared difference of both poses.
     """
 
     relative_pose: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
@@ -96,7 +119,7 @@ class Localised:
         covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_camera``; None if the
             verdict is ``none``.
         inliers: Number of inliers of the best keyframe, which is the candidate with most inliers, also if the
-            pose was computed from several keyframes.
+            pose was computed from several keyframes, or by a guided search.
         matches: Number of matches of the best keyframe.
         rmse_px: Root mean square reprojection error of the inliers of the best keyframe, at its own estimate.
         keyframes: Ids of the keyframes whose estimates agree, the one with most inliers first.
@@ -148,7 +171,11 @@ _DEFAULT = LocalisationOptions()
 
 
 def localise(
-    candidates: Sequence[LocalisationCandidate], view: View, options: LocalisationOptions = _DEFAULT
+    candidates: Sequence[LocalisationCandidate],
+    view: View,
+    options: LocalisationOptions = _DEFAULT,
+    *,
+    landmarks_around: Callable[[Array, Sequence[int]], MapLandmarks] | None = None,
 ) -> Localised:
     """Return the pose of *view* in the map of *candidates*; deterministic.
 
@@ -158,6 +185,9 @@ def localise(
             alike.
         view: The image whose pose is estimated.
         options: Conditions under which the pose is ok.
+        landmarks_around: Returns the landmarks of the map around a pose ``(4, 4)``, also those of the given
+            ids of candidates.  With it, the pose of a view without depths is that of a guided search if this
+            finds one, see `search_around`; None for no such search.
 
     Raises:
         BadRequest: The descriptors of a candidate and of the view are of different kinds.
@@ -181,11 +211,29 @@ def localise(
     if (view.depths_m is None or not view.is_metric) and len(agreeing) > 1:
         solution = _solve_jointly(agreeing, view, options)
         T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
-    # 4. Find the first reason not to trust the pose; enlarge the covariance if the camera may be wrong.
+    # 4. Find the first reason not to trust the pose.
     reason = _weakness(agreeing, contradicting, solution, options)
+    # 5. Search again around the pose.  If the landmarks around it confirm it together, it does not matter
+    # that single keyframes have few matches.
+    guided = None
+    if landmarks_around is not None and view.depths_m is None:
+        guided = search_around(
+            T_map_camera,
+            landmarks_around(T_map_camera, [estimate.keyframe for estimate in agreeing]),
+            view,
+            min_inliers=max(options.min_candidate_inliers, best.measured.inliers // 2),
+            inlier_px=options.relative_pose.inlier_px,
+        )
+    if guided is not None:
+        T_map_camera = guided.T_map_camera
+        covariance = guided.covariance + _guided_floor(T_map_camera)
+        if reason in _FEW_MATCHES and guided.is_sure:
+            reason = ""
+    # 6. Enlarge the covariance if the camera may be wrong.
     if options.fits_camera and view.depths_m is None:
-        fit = fit_camera(*_collect_matches(agreeing), T_map_camera, view.camera)
-        covariance = covariance + _camera_covariance(fit, T_map_camera)
+        matches = _collect_matches(agreeing) if guided is None else guided.matches
+        fit = fit_camera(*matches, T_map_camera, view.camera)
+        covariance = covariance + _CAMERA_WEIGHT * _camera_covariance(fit, T_map_camera)
         reason = reason or _camera_weakness(fit, T_map_camera)
     scale = None if view.is_metric else _estimate_scale(agreeing, options)
     if scale is None and not view.is_metric:
@@ -222,17 +270,25 @@ def spread_candidates(
         options: The size of a region, and the number of candidates from each.
     """
     candidates: list[int] = []
-    # The trace of a rotation matrix is 1 + 2 cos(angle).
-    min_trace = 1.0 + 2.0 * math.cos(math.radians(options.region_deg))
     for number, _ in similar:
-        pose, others = T_map_camera[number], T_map_camera[candidates]
-        is_near = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1) <= options.region_m
-        is_near &= np.einsum("kij,ij->k", others[:, :3, :3], pose[:3, :3]) >= min_trace
+        is_near = is_in_region(T_map_camera[candidates], T_map_camera[number], options)
         if np.count_nonzero(is_near) < options.max_per_region:
             candidates.append(number)
         if len(candidates) == count:
             break
     return candidates
+
+
+def is_in_region(
+    T_map_keyframes: Array, T_map_camera: Array, options: LocalisationOptions
+) -> npt.NDArray[np.bool_]:
+    """Return ``(n,)``, whether each of the poses ``(n, 4, 4)`` is of one region with a pose ``(4, 4)``."""
+    # The trace of a rotation matrix is 1 + 2 cos(angle).
+    min_trace = 1.0 + 2.0 * math.cos(math.radians(options.region_deg))
+    distances_m = np.linalg.norm(T_map_keyframes[:, :3, 3] - T_map_camera[:3, 3], axis=1)
+    traces = np.einsum("kij,ij->k", T_map_keyframes[:, :3, :3], T_map_camera[:3, :3])
+    is_in: npt.NDArray[np.bool_] = (distances_m <= options.region_m) & (traces >= min_trace)
+    return is_in
 
 
 def _estimate_poses(
@@ -282,6 +338,17 @@ def _collect_matches(estimates: Sequence[_Estimate]) -> tuple[Array, Array, Arra
     origins = [np.tile(e.T_map_keyframe[:3, 3], (e.measured.matches, 1)) for e in estimates]
     pixels = [e.measured.pixels for e in estimates]
     return np.concatenate(points), np.concatenate(origins), np.concatenate(pixels)
+
+
+def _guided_floor(T_map_camera: Array) -> Array:
+    """Return the ``(6, 6)`` covariance (metres, radians) that is added to that of a guided search.
+
+    It is of the twist on the left of *T_map_camera*.
+    """
+    floor = np.diag([_GUIDED_FLOOR_M**2] * 3 + [math.radians(_GUIDED_FLOOR_DEG) ** 2] * 3)
+    to_map = adjoint(T_map_camera)
+    floor_map: Array = to_map @ floor @ to_map.T
+    return floor_map
 
 
 def _camera_covariance(fit: CameraFit, T_map_camera: Array) -> Array:

@@ -6,10 +6,14 @@ would explain as well, is not ok.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+
 import msgspec
+import numpy as np
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, transform
 from rse_pf.service import Registry
 from rse_pf.services.mapping.place import (
     FeatureKind,
@@ -19,7 +23,14 @@ from rse_pf.services.mapping.place import (
     open_map,
     view_of,
 )
-from rse_pf.slam.localise import LocalisationCandidate, LocalisationOptions, localise, spread_candidates
+from rse_pf.slam.guided_search import MapLandmarks
+from rse_pf.slam.localise import (
+    LocalisationCandidate,
+    LocalisationOptions,
+    is_in_region,
+    localise,
+    spread_candidates,
+)
 from rse_pf.slam.relative_pose import RelativePoseOptions, View, landmarks_of_keyframe
 from rse_pf.wire.arrays import Array
 
@@ -29,6 +40,12 @@ _RETRIEVAL_FACTOR = 6
 """Quotient of the number of keyframes that place recognition retrieves and the number of candidates that are
 chosen from them, so that the candidates include other parts of the map that look alike (perceptual
 aliases)."""
+_MATCH_RATIO = 0.85
+"""Limit of Lowe's ratio test between a view and a keyframe: photos are taken from other positions than
+keyframes, so that right matches are less distinct than between neighbouring frames."""
+_SEARCHED_KEYFRAMES = 12
+"""Number of keyframes around a first pose whose landmarks the guided search matches: those that agree with
+the pose, and the nearest others."""
 
 
 class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -48,12 +65,12 @@ class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
         BadRequest: A number is out of its range.
     """
 
-    candidates: int = 8
-    min_inliers: int = 30
+    candidates: int = 16
+    min_inliers: int = 15
     min_inlier_ratio: float = 0.3
     agree_m: float = 0.15
     agree_deg: float = 5.0
-    inlier_px: float = 3.0
+    inlier_px: float = 6.0
 
     def __post_init__(self) -> None:
         if not (1 <= self.candidates <= 100 and self.min_inliers >= 12 and 0 < self.inlier_px <= 100):
@@ -144,6 +161,7 @@ def locate(
     # the map, so that the view is also matched to another region that looks alike.
     limits = LocalisationOptions(
         relative_pose=RelativePoseOptions(
+            ratio=_MATCH_RATIO,
             min_inliers=options.min_inliers,
             min_inlier_ratio=options.min_inlier_ratio,
             inlier_px=options.inlier_px,
@@ -155,21 +173,51 @@ def locate(
         fits_camera=True,
     )
     rows = spread_candidates(similar, index.T_map_keyframe, options.candidates, limits)
-    keyframes = [index.keyframes[row] for row in rows]
     candidates = [
-        LocalisationCandidate(id=k.id, landmarks=landmarks_of_keyframe(k), T_map_keyframe=k.T_world_camera)
-        for k in keyframes
+        LocalisationCandidate(
+            id=row,
+            landmarks=landmarks_of_keyframe(index.keyframes[row]),
+            T_map_keyframe=index.keyframes[row].T_world_camera,
+        )
+        for row in rows
     ]
-    # 3. Estimate the pose of the view with each candidate, and decide by their agreement whether it is ok.
-    located = localise(candidates, view, limits)
+    # 3. Estimate the pose of the view with each candidate, decide by their agreement whether it is ok, and
+    # estimate it again with the landmarks of all keyframes around it.
+    located = localise(
+        candidates, view, limits, landmarks_around=functools.partial(_landmarks_around, index, limits)
+    )
     return LocaliseReply(
         verdict="lost" if located.verdict == "none" else located.verdict,
         reason=located.reason,
         T_map_camera=located.T_map_camera,
         inliers=located.inliers,
         rmse_px=located.rmse_px,
-        keyframes=list(located.keyframes),
+        keyframes=[index.keyframes[row].id for row in located.keyframes],
         covariance=located.covariance,
+    )
+
+
+def _landmarks_around(
+    index: MapIndex, limits: LocalisationOptions, T_map_camera: Array, agreeing: Sequence[int]
+) -> MapLandmarks:
+    """Return the landmarks of the *agreeing* keyframes, given as rows of *index*, and of those around a pose.
+
+    Around a pose are the nearest keyframes of its region.
+    """
+    poses = index.T_map_keyframe
+    region = np.flatnonzero(is_in_region(poses, T_map_camera, limits))
+    distances_m = np.linalg.norm(poses[region, :3, 3] - T_map_camera[:3, 3], axis=1)
+    nearest = region[np.argsort(distances_m, kind="stable")]
+    chosen = list(dict.fromkeys([*agreeing, *nearest.tolist()]))[:_SEARCHED_KEYFRAMES]
+    landmarks = [landmarks_of_keyframe(index.keyframes[row]) for row in chosen]
+    return MapLandmarks(
+        points_map=np.concatenate(
+            [transform(poses[row], found.points_camera) for row, found in zip(chosen, landmarks, strict=True)]
+        ),
+        origins_map=np.repeat(
+            poses[chosen][:, :3, 3], [len(found.descriptors) for found in landmarks], axis=0
+        ),
+        descriptors=np.concatenate([found.descriptors for found in landmarks]),
     )
 
 
