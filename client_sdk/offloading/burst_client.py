@@ -122,7 +122,7 @@ class BurstClient:
         return burst_address(url, self._read_access()[0]) if url else None
 
     def expected_s(self, service: str) -> float | None:
-        """Return the expected time of an answer in seconds; None if no command for *service* may be sent now."""
+        """Return the expected time of an answer in seconds; None if *service* may not be sent now."""
         if service not in BURST_SERVICES or self.address is None:
             return None
         now_s = self._clock()
