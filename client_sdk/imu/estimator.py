@@ -35,8 +35,8 @@ _MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)
 # alignment with a larger one is discarded.
 _MAX_MISFIT = 12.0
 _MAX_MISFITS_IN_A_ROW = 3
-"""After this many successive alignments with a misfit above `_MAX_MISFIT` the IMU is not used any more; the
-cause of fewer may be a wrong pose."""
+"""After this many successive alignments with a misfit above `_MAX_MISFIT` the IMU is not used any more
+(`ImuEstimator.trouble`); the cause of fewer may be a wrong pose."""
 _MAX_BIAS_CHANGE_RAD_S = 0.005
 """A cached motion is preintegrated again if an axis of the gyroscope's bias has changed by more than this
 since."""

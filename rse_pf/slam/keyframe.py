@@ -536,7 +536,7 @@ def decode_keyframe(data: bytes) -> SentKeyframe:
         raise _bad_keyframe(
             "T_odom_camera is no rigid motion", "send three rows of a rotation and a translation in metres"
         )
-    # 2. Find where the content of each block begins and ends; unknown optional blocks are kept.
+    # 2. Find where the content of each block begins and ends; copy unknown optional blocks byte for byte.
     spans: dict[int, tuple[int, int]] = {}
     unknown_blocks = []
     for kind, begin, end in _find_blocks(data, block_count):

@@ -95,7 +95,7 @@ class PoseGraph:
             raise BadRequest("an edge connects a pose to itself", hint="leave this edge out")
         if len(np.unique(self.ids)) != n:
             raise BadRequest("two poses have one id", hint="give each pose its own id")
-        # A frozen dataclass can be changed only in this way.
+        # Check the poses, and replace those that are not exact; a frozen dataclass allows no other way.
         object.__setattr__(self, "T_world_pose", _checked_poses("a pose", self.T_world_pose))
         object.__setattr__(self, "T_a_b", _checked_poses("an edge", self.T_a_b))
         if not is_positive_definite(self.information):
