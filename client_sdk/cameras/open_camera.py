@@ -175,7 +175,10 @@ def open_camera(
 def _open_folder(
     path: Path, lens: Intrinsics, stated_by: str, rate_hz: float | None, use_depth: bool
 ) -> FrameSource:
-    """Return the frames of a folder of images, with depth if there is some and *use_depth* is set."""
+    """Return the frames of a folder of images, with depth if the folder has some and *use_depth* is set.
+
+    *stated_by* names the file of *lens* in messages.  The frames are thinned to *rate_hz*; None yields all.
+    """
     images = list_folder(path, lens.rate_hz)
     has_depth = use_depth and images.partners is not None
     facts = images.facts(lens, stated_by, has_depth=has_depth)
@@ -205,7 +208,8 @@ def _open_single(
         lens: Intrinsics by which the images are undistorted.
         rate_hz: Frames per second to which the frames are thinned; None yields all.
         has_depth: Whether the frames have depth, as the `FrameSource` will state.
-        close: Closes the device or the file; called when the `FrameSource` is closed, or before an error.
+        close: Closes the device or the file; called when the `FrameSource` is closed, or if facts
+            contradict each other.
         span_s: First and last time stamp of the frames, s; None takes the span of *facts*.
 
     Raises:
@@ -261,7 +265,8 @@ def source_of_frames(
     """Return a `FrameSource` of *frames* that are undistorted already, and whose depth is registered.
 
     If *has_depth* is False, the depth image of each frame is replaced by an empty one.  *close* releases the
-    file of the frames.  All other arguments are attributes of `FrameSource`.
+    file of the frames.  All other arguments are attributes of `FrameSource`.  A frame that is not later than
+    the frame before is left out.
     """
     empty_depth = make_empty_depth(camera)
     log = DoubtLog() if log is None else log
@@ -292,7 +297,10 @@ def is_recording(path: Path) -> bool:
 def _open_stereo_video(
     word: str, rig: Rig, rate_hz: float | None, camera: CameraChoice | None, stated_by: str
 ) -> FrameSource:
-    """Return the frames of two devices or videos, or of one that gives both images side by side."""
+    """Return the frames of two devices or videos (``LEFT,RIGHT``), or of one with both images side by side.
+
+    *camera* and *rate_hz* are those of `_open_pair`, and *stated_by* names the file of *rig* in messages.
+    """
     if word.count(",") == 1:
         names = (word.split(",")[0], word.split(",")[1])
         both = open_pair_videos(*names)
@@ -313,9 +321,11 @@ def _open_pair(
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameSource:
-    """Check the facts of a stereo pair, and return its rectified frames.
+    """Check the facts of a stereo pair, and return its rectified frames, thinned to *rate_hz* (None: all).
 
-    If *camera* is ``left``, they are those of the left camera alone, undistorted and not rectified.
+    If *camera* is ``left``, they are those of the left camera alone, undistorted and not rectified.  *close*
+    releases the devices or videos; it is called when the `FrameSource` is closed, or if facts contradict each
+    other.
 
     Raises:
         UsageError: Two facts contradict each other, or *rig* has one camera.

@@ -169,7 +169,7 @@ class CommandRouter:
                 elapsed_s = self._clock() - began_s
                 if elapsed_s >= call.deadline_s:
                     return expired
-                # 2. Ask the places whose time has come.
+                # 2. Ask the places whose time has come, or the next one if no place is working.
                 while requests and (requests[0].after_s <= elapsed_s or not running):
                     request = requests.popleft()
                     left_s = call.deadline_s - elapsed_s

@@ -16,8 +16,8 @@ __all__ = ["CloudFirst", "Plan"]
 
 FALLBACK_MARGIN = 2.0
 """A fallback is asked this many times its expected answer time before its answer is needed, so that an answer
-that is slower than expected is still in time.  Only slow servers delay the burst function
-(`_burst_after_s`)."""
+that is slower than expected is still in time.  If the servers are slow, the burst function is asked later
+than that (`_burst_after_s`)."""
 
 RECOVERABLE_CODES = frozenset(
     {
