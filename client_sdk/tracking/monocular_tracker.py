@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from client_sdk.frontend import Features, Frame, PoseQuery, TrackedFrame, describe, make_features
 from client_sdk.monocular.bundle import adjust
-from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
+from client_sdk.monocular.two_view import TwoViewStart, share_in_third_view, start_from_two_views
 from client_sdk.plugins import Plugins
 from client_sdk.tracking.landmark_map import (
     MAX_KEYFRAMES,
@@ -74,6 +74,12 @@ _MAX_WAITING_FRAMES = 30
 dropped: bounds memory."""
 _MIN_START_MATCHES = 100
 """Fewest features of a frame, and fewest matches between two frames, with which a segment can begin."""
+_MANY_START_MATCHES = 200
+"""Number of matches with a waiting view from which newer ones are not tried: they have less parallax.  A
+street at 4.8 frames a second has 279 matches with the frame before and 129 with the one before that."""
+_MIN_THIRD_VIEW_SHARE = 0.7
+"""Smallest share of the points of a start with which a third view must agree: 0.8 to 1.0 where the camera
+moves, 0.6 to 0.7 where it nearly only turns and the points are wrong."""
 _WIDE_SEARCH_FACTOR = 2.5
 """Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
 _TRACKED_RATIO = 0.25
@@ -170,6 +176,23 @@ class _Attempt:
     against: Literal["map", "frame", "keyframe"]
     min_matches: int
     keyframe: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Start:
+    """Two views that begin a segment.
+
+    Attributes:
+        views: Relative pose and points of the two views.
+        first: Number of the waiting frame that is the first view; the present frame is the second one.
+        rows: Features of the first view that match, to which the rows of *views* refer.
+        columns: Features of the second view that match them.
+    """
+
+    views: TwoViewStart
+    first: int
+    rows: Rows
+    columns: Rows
 
 
 class MonocularTracker:
@@ -567,10 +590,10 @@ class MonocularTracker:
         """
         if len(view.features) >= _MIN_START_MATCHES:
             self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
-            start, rows, columns, start_reason = self._find_start(view)
+            start, start_reason = self._find_start(view)
             may_begin = not self._segments or self._state.unrecognised > self.options.segment_after
             if start is not None and may_begin:
-                return self._begin_segment(view, start, rows, columns)
+                return self._begin_segment(view, start)
             self._waiting.append((self._frame.timestamp_s, view))
             reason = reason if self._segments else start_reason
         elif not self._segments:
@@ -582,53 +605,75 @@ class MonocularTracker:
         self.starting_frames += 1
         return self._make_result_without_pose("starting", reason)
 
-    def _find_start(self, view: MonocularView) -> tuple[TwoViewStart | None, Rows, Rows, str]:
-        """Find the oldest waiting view that shows the same place as the present one, and their relative pose.
+    def _find_start(self, view: MonocularView) -> tuple[_Start | None, str]:
+        """Find a waiting view that begins a segment together with the present one.
 
-        Older waiting views, which do not show that place, are dropped.
+        The oldest waiting view is tried first, as its parallax is the largest.  Where it has few matches, as
+        after a fast drive forward, the view halfway between it and the present one is tried next, and so on.
 
         Returns:
-            The start, None if the two views do not suffice; the rows of matched features in both views; why
-            there is no start.
+            The start, or None and why there is none.
         """
-        reason = "the first frame"
-        while self._waiting:
-            first = self._waiting[0][1]
+        if len(self._waiting) == _MAX_WAITING_FRAMES:
+            self._waiting.pop(0)
+        number, reason = 0, "the first frame"
+        while number < len(self._waiting):
+            first = self._waiting[number][1]
             rows, columns = match_all(first.features.descriptors, view.features.descriptors)
-            if len(rows) >= _MIN_START_MATCHES and len(self._waiting) < _MAX_WAITING_FRAMES:
-                start = start_from_two_views(
+            if len(rows) < _MIN_START_MATCHES:
+                reason = f"only {len(rows)} matches with the frames before"
+            else:
+                views = start_from_two_views(
                     first.features.pixels[rows],
                     view.features.pixels[columns],
                     self._frame.camera,
                     min_parallax_deg=self.options.start_parallax_deg,
                 )
-                return (None if start.reason else start), rows, columns, start.reason
-            self._waiting.pop(0)
-            reason = f"only {len(rows)} matches with the first view"
-        none = np.empty(0, dtype=np.int64)
-        return None, none, none, reason
+                reason = views.reason or self._refute(views, number, rows)
+                if not reason:
+                    return _Start(views=views, first=number, rows=rows, columns=columns), ""
+                if views.is_still or len(rows) >= _MANY_START_MATCHES:
+                    break
+            number += max(1, (len(self._waiting) - number) // 2)
+        return None, reason
 
-    def _begin_segment(
-        self, view: MonocularView, start: TwoViewStart, rows: Rows, columns: Rows
-    ) -> TrackedFrame:
-        """Begin a segment with the first waiting view and the present one.
+    def _refute(self, views: TwoViewStart, first: int, rows: Rows) -> str:
+        """Say why a third waiting view does not agree with a start; return an empty text if it does.
+
+        The third view is that halfway between the two, or the one before the first if there is none between.
 
         Args:
-            view: The present, second view.
-            start: Relative pose and points of the two views.
-            rows: Features of the first view that match.
-            columns: Features of the second view that match them.
+            views: Pose and points of the waiting view *first* and the present one.
+            first: Number of that waiting view.
+            rows: Its features that match, to which the rows of *views* refer.
         """
+        between = (first + len(self._waiting)) // 2
+        number = between if between > first else first - 1
+        if number < 0:
+            return "a third view has not come yet"
+        third = self._waiting[number][1].features
+        descriptors = self._waiting[first][1].features.descriptors[rows]
+        shown, columns = match_all(descriptors, third.descriptors)
+        share = share_in_third_view(views, shown, third.pixels[columns], self._frame.camera)
+        if share < _MIN_THIRD_VIEW_SHARE:
+            return f"a third view agrees with {100 * share:.0f} % of the points only"
+        return ""
+
+    def _begin_segment(self, view: MonocularView, start: _Start) -> TrackedFrame:
+        """Begin a segment with a waiting view and the present one."""
         # 1. Make a map of two keyframes in a unit in which the median depth is 2, and adjust it.
-        first_s, first = self._waiting[0]
-        unit = _START_DEPTH / float(np.median(start.points[:, 2]))
+        views = start.views
+        first_s, first = self._waiting[start.first]
+        unit = _START_DEPTH / float(np.median(views.points[:, 2]))
         adjuster = self._plugins.optimiser or adjust
         new_map = LandmarkMap(self._frame.camera, adjuster)
-        for new_view, pose in ((first, np.eye(4)), (view, scaled(start.T_second_first, unit))):
+        for new_view, pose in ((first, np.eye(4)), (view, scaled(views.T_second_first, unit))):
             new_map.add_keyframe(new_view, pose, np.full(len(new_view.features), NO_LANDMARK))
-        new_map.add_landmarks(unit * start.points, (0, rows[start.rows]), (1, columns[start.rows]))
+        new_map.add_landmarks(
+            unit * views.points, (0, start.rows[views.rows]), (1, start.columns[views.rows])
+        )
         new_map.adjust_all()
-        # 2. Give the frames between the two views their poses.
+        # 2. Give the frames before the second view their poses.
         is_first = not self._segments
         number = self._next_segment
         self._next_segment += 1
@@ -636,7 +681,7 @@ class MonocularTracker:
         segment.set_reference(1)
         segment.add_frame(first_s, np.eye(4), 0)
         second = new_map.keyframes[1]
-        T_before = self._pose_waiting_frames(segment, second.T_camera_world)
+        T_before = self._pose_waiting_frames(segment, start.first, second.T_camera_world)
         if not is_first:
             self.lost_frames -= len(segment.frames)
         # 3. Keep the present frame as the last one, from which the next frame is tracked.
@@ -644,7 +689,7 @@ class MonocularTracker:
             view=view,
             T_camera_world=second.T_camera_world,
             landmarks=second.landmarks,
-            matches=len(rows),
+            matches=len(start.rows),
             is_weak=False,
         )
         self._state = _TrackState(
@@ -655,16 +700,26 @@ class MonocularTracker:
         )
         return self._make_result(posed, is_keyframe=True)
 
-    def _pose_waiting_frames(self, segment: MonocularSegment, T_second: Array) -> Array | None:
-        """Fit the poses of the frames between the two views of a start, each from an interpolated guess.
+    def _pose_waiting_frames(self, segment: MonocularSegment, first: int, T_second: Array) -> Array | None:
+        """Fit the poses of the frames before the second view of a start.
 
-        *T_second* is ``T_camera_world`` of the second view.  Returned is that of the frame just before it,
-        None if that frame has no pose.  Frames without a pose are left out; no frame waits any more
-        afterwards.
+        Frames after the first view are fitted from an interpolated guess, then those before it from a
+        constant velocity, until one has no pose.  No frame waits any more afterwards.
+
+        Args:
+            segment: The new segment, whose origin is the first view.
+            first: Number of the waiting frame that is the first view.
+            T_second: ``(4, 4)``, ``T_camera_world`` of the second view.
+
+        Returns:
+            ``T_camera_world`` of the frame just before the second view; None if that frame has no pose.
         """
-        count = len(self._waiting)
-        pose, newest = np.eye(4), None
-        for number, (timestamp_s, view) in enumerate(self._waiting[1:], start=1):
+        waiting, self._waiting = self._waiting, []
+        count = len(waiting)
+        pose, newest = np.eye(4), None if first < count - 1 else np.eye(4)
+        step = -T_second[:3, 3] / (count - first)
+        for number in range(first + 1, count):
+            timestamp_s, view = waiting[number]
             guess = pose.copy()
             guess[:3, 3] += (T_second[:3, 3] - pose[:3, 3]) / (count - number + 1)
             posed = segment.fit(view, guess, self.options.search_px, self.options.min_inliers)
@@ -672,7 +727,16 @@ class MonocularTracker:
             if posed is not None:
                 newest = pose = posed.T_camera_world
                 segment.add_frame(timestamp_s, pose, 0)
-        self._waiting = []
+        pose = np.eye(4)
+        for timestamp_s, view in reversed(waiting[:first]):
+            guess = pose.copy()
+            guess[:3, 3] += step
+            posed = segment.fit(view, guess, self.options.search_px, self.options.min_inliers)
+            if posed is None:
+                break
+            step = posed.T_camera_world[:3, 3] - pose[:3, 3]
+            pose = posed.T_camera_world
+            segment.add_frame(timestamp_s, pose, 0)
         return newest
 
     # --- Keep ---

@@ -202,7 +202,7 @@ async def test_a_mapper_tracks_with_the_features_of_its_user(function: Any, dept
     pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
     mapper = Mapper(ask=solve, features=function, keyframes_of="robot-1" if depth else "")
 
-    statuses = [(await mapper.track(frame_at(row, depth=depth))).status for row in range(8 if depth else 14)]
+    statuses = [(await mapper.track(frame_at(row, depth=depth))).status for row in range(8 if depth else 18)]
 
     assert statuses.count("tracked") >= 6, statuses
     positions = mapper.trajectory.positions

@@ -116,7 +116,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
     if _without_pose(report) > _MOST * report["frames"]:
         third = f"failed: {_without_pose(report)} of {counted(report['frames'], 'frame')} have no pose\n"
         if report["frames_before_start"]:
-            third += "a camera without depth begins once it has moved sideways, over things with texture\n"
+            third += "a camera without depth begins once it has moved, not only turned, over texture\n"
     if "merged" in report:
         third += merged_lines(report["merged"])
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "

@@ -313,7 +313,7 @@ def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.Capt
     error = capsys.readouterr().err
     assert code == 1
     assert "3 of 3 frames have no pose in the map" in error
-    assert "must move sideways" in error
+    assert "must move, not only turn" in error
 
 
 @pytest.mark.parametrize(
