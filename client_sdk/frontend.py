@@ -125,8 +125,6 @@ class FrontEndOptions:
         inlier_px: Largest reprojection error, in pixels, of an inlier of a pose query.
         max_iterations: Largest number of RANSAC iterations.
         min_inliers: Smallest number of inliers of an accepted pose; a keyframe needs twice as many.
-        max_jump_m: Largest plausible translation between two frames; after a loss, and for a stereo pair that
-            sees far, the tracker allows more.
         keyframe_m: A frame becomes a keyframe if no keyframe of its segment is both within this distance, in
             metres, and rotated against it by at most *keyframe_deg*.
         keyframe_deg: See *keyframe_m*.
@@ -151,7 +149,6 @@ class FrontEndOptions:
     inlier_px: float = 3.0
     max_iterations: int = 1000
     min_inliers: int = 20
-    max_jump_m: float = 0.5
     keyframe_m: float = 0.15
     keyframe_deg: float = 10.0
     keyframe_share: float = 0.6
@@ -204,9 +201,9 @@ class FrontEndOptions:
 
         4,000 features, four times the default, find the few matches that survive such a change of view: 24,
         32, 30 and 530 inliers for the four pairs of neighbouring views of that room, where 3,000 features
-        find 11 to 13 for the first pair.  ``max_jump_m`` is above the distance of the views.
+        find 11 to 13 for the first pair.
         """
-        return cls(features=4000, is_spread=False, inlier_px=4.0, min_inliers=12, max_jump_m=1.5)
+        return cls(features=4000, is_spread=False, inlier_px=4.0, min_inliers=12)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -73,13 +73,6 @@ car's camera."""
 _ENOUGH_MAP_MATCHES = 120
 """With this many matched landmarks of the map, a pose is verified without points of the last frame: a chain
 of frames drifts, the map does not."""
-_MAX_JUMPS = 4
-"""Largest multiple of the plausible motion between two frames that is allowed after a loss; the multiple is 2
-after one lost frame, and grows by one with each further lost frame up to this.  A recognised place farther
-away is accepted only by a clear answer."""
-_STEREO_JUMP_SHARE = 0.15
-"""Largest plausible motion of a stereo pair between two frames, as a share of the median depth that it sees,
-where this is more than ``max_jump_m``: a fast car sees far."""
 _MIN_INTERVAL_S = 1e-3
 """Smallest time between two frames, in seconds, by which a rotation is divided: time stamps may repeat."""
 _MAX_RATE_RAD_S = 3.0
@@ -470,7 +463,7 @@ class Tracker:
                 continue
             # 2. Far from the last pose, only a clear answer by a known place is accepted: perceptual aliases,
             #    places that look alike, exist.
-            is_near = attempt.segment == self._state.segment and self._is_plausible(T_world_camera)
+            is_near = self._is_near(T_world_camera, attempt)
             has_support = not attempt.is_recognised or answer.inliers >= _NEARBY_RATIO * count
             is_clear = attempt.is_recognised and answer.is_clear(count)
             if not ((is_near and has_support) or is_clear):
@@ -524,22 +517,19 @@ class Tracker:
 
     # --- Verify ---
 
-    def _is_plausible(self, T_world_camera: Array) -> bool:
-        """Return whether the camera can have moved so far since its last pose; rotations are not limited.
+    def _is_near(self, T_world_camera: Array, attempt: _Attempt) -> bool:
+        """Return whether a pose lies near the last one in the same segment.
 
-        The limit grows with the number of frames that were lost in a row.
+        It does if the camera moved by at most the median distance of the matched landmarks, whatever time
+        passed: a view from farther away shows another scene.  Rotations are not limited.
         """
-        jump_m = self.options.max_jump_m
-        depths_m = self._raw.features.points_camera[:, 2]
-        if self._frame.stereo is not None and np.isfinite(depths_m).any():
-            median_m = float(np.median(depths_m[np.isfinite(depths_m)]))
-            jump_m = max(jump_m, _STEREO_JUMP_SHARE * median_m)
-        limit_m = jump_m * min(1 + self._state.lost_in_a_row, _MAX_JUMPS)
-        moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._state.T_world_camera[:3, 3]))
-        return moved_m <= limit_m
+        position = T_world_camera[:3, 3]
+        moved_m = np.linalg.norm(position - self._state.T_world_camera[:3, 3])
+        distance_m = np.median(np.linalg.norm(attempt.matches.points - position, axis=1))
+        return attempt.segment == self._state.segment and bool(moved_m <= distance_m)
 
     def _is_continuous(self, T_world_camera: Array) -> bool:
-        """Return whether the camera moved from the pose of the frame before to this plausible one.
+        """Return whether the camera moved from the pose of the frame before to this near one.
 
         After a loss, or a cut in a video (a rotation that is too fast), it did not, and its rotation rate is
         unknown.

@@ -12,7 +12,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.mapper import Mapper
 from rse_pf.geometry import Camera
 
-__all__ = ["CAMERA", "STEP_M", "covered", "foreign", "frame_at", "tracked"]
+__all__ = ["CAMERA", "DEPTHS_M", "STEP_M", "covered", "foreign", "frame_at", "tracked"]
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=159.5, cy=119.5, width=320, height=240)
 DEPTHS_M = (2.0, 4.0 / 3.0, 1.0)

@@ -15,7 +15,7 @@ from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference
-from tests.client_sdk.mapper.flat_world import STEP_M, covered, foreign, frame_at
+from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, covered, foreign, frame_at
 from tests.client_sdk.tracking.driving import NO_ANSWER, Answer, run, run_all, solve
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -119,12 +119,19 @@ def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its
     assert found.segment == 0
 
 
-@pytest.mark.parametrize(("row", "is_found"), [(15, True), (8, False)])
-def test_an_unclear_place_is_accepted_only_within_four_jumps_however_long_the_camera_was_lost(
+def test_a_camera_that_moves_half_a_metre_between_two_images_is_tracked() -> None:
+    tracker = Tracker()
+
+    for row in (0, 18, 36, 54):
+        assert_at(run(tracker, frame(row)), row)
+
+
+@pytest.mark.parametrize(("row", "is_found"), [(45, True), (4, False)])
+def test_an_unclear_place_is_accepted_only_if_the_camera_moved_less_than_the_distance_of_what_it_sees(
     row: int, is_found: bool
 ) -> None:
-    tracker = Tracker(FrontEndOptions(max_jump_m=0.1))
-    run_all(tracker, map(frame, range(25)))
+    tracker = Tracker()
+    run_all(tracker, map(frame, range(67)))
     run_all(tracker, (covered(frame(row)) for row in range(30)))
 
     def doubtful(query: PoseQuery) -> Answer:
@@ -133,7 +140,8 @@ def test_an_unclear_place_is_accepted_only_within_four_jumps_however_long_the_ca
 
     shown = run(tracker, frame(row), doubtful)
 
-    assert (24 - 15) * STEP_M < 0.4 < (24 - 8) * STEP_M
+    assert min(DEPTHS_M) > (66 - 45) * STEP_M
+    assert np.median(DEPTHS_M) < (66 - 4) * STEP_M
     assert not shown.lost if is_found else shown.lost
 
 
@@ -239,6 +247,29 @@ def test_recordings_that_turn_quickly_are_not_lost(
     assert dataset.truth is not None
     assert tracker.lost_frames <= most_lost
     assert 100 * accuracy(estimate, dataset.truth).ate_m <= ate_cm
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "rate_hz", "most_lost"),
+    [
+        ("7scenes_redkitchen", 1, 0),
+        ("euroc_mh01_start", 2, 0),
+        ("euroc_mh01_start", 1, 1),  # the lost image shares 29 % of its view with the one before
+        ("kitti_06_start", 2, 0),
+    ],
+)
+def test_recordings_with_one_or_two_images_a_second_are_not_lost(
+    name: str, rate_hz: float, most_lost: int
+) -> None:
+    if not (RECORDED / name).exists():
+        pytest.skip(f"no recording {name} at {RECORDED}")
+    tracker = Tracker()
+
+    tracked = run_all(tracker, open_dataset(RECORDED / name).thinned(rate_hz))
+
+    assert tracker.lost_frames <= most_lost
+    assert {shown.segment for shown in tracked} == {0}
 
 
 @pytest.mark.data
