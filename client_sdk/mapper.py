@@ -199,6 +199,7 @@ class Mapper:
         self._round_trips_ms: list[float] = []
         self._answer_sources: Counter[str] = Counter()
         self._lost_reasons: Counter[str] = Counter()
+        self._start_reason = ""
 
     async def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
         """Return the pose of the next frame, or the reason why it has none.
@@ -289,6 +290,11 @@ class Mapper:
     def frames_before_start(self) -> int:
         """Number of frames of a camera without depth before it had moved enough to begin."""
         return self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
+
+    @property
+    def start_reason(self) -> str:
+        """Why a camera without depth has no first pose yet, such as that it only turns; empty once it has."""
+        return self._start_reason
 
     @property
     def keyframes(self) -> int:
@@ -397,6 +403,7 @@ class Mapper:
             "frames": self.frames,
             "lost_frames": self.lost_frames,
             "frames_before_start": self.frames_before_start,
+            "not_started_because": self.start_reason,
             "keyframes": self.keyframes,
             "segments_apart": len(separate),
             "frames_apart": sum(len(record.poses) for record, _ in separate),
@@ -618,6 +625,7 @@ class Mapper:
             status = "lost"
         if status == "lost":
             self._lost_reasons[reason] += 1
+        self._start_reason = reason if status == "starting" else ""
         if isinstance(tracker, Tracker) and pose is not None and not self._records.first.poses:
             status = "first"
         # 3. Count round trip and source of the last answer, and add them to the result with its covariance.

@@ -465,6 +465,11 @@ class LiveMapper:
         return self._mapper.frames_before_start
 
     @property
+    def start_reason(self) -> str:
+        """Why a camera without depth has no first pose yet; empty once it has."""
+        return self._mapper.start_reason
+
+    @property
     def keyframes(self) -> int:
         """Number of keyframes that were put into the queue for the map in this run."""
         return self._made_keyframes

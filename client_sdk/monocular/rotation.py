@@ -31,12 +31,6 @@ class RotationFit:
     R_second_first: Array
     errors_px: Array
 
-    @property
-    def angle_deg(self) -> float:
-        """The angle of the rotation, in degrees."""
-        cosine = (np.trace(self.R_second_first) - 1.0) / 2.0
-        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
 
 def fit_rotation(first: Array, second: Array, camera: Camera, *, inlier_px: float) -> RotationFit:
     """Find the rotation that explains the most matches of two views, by RANSAC with a fixed seed.

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.rotation import fit_rotation
-from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.geometry import Array, Camera, inverse, rotation_angle_deg
 from rse_pf.images import load_opencv
 from rse_pf.slam.triangulation import parallax_deg, triangulate
 
@@ -47,6 +47,9 @@ a flat thing moves before a stationary camera; 0.6 to 0.85 in streets, 0.7 to 0.
 _MAX_PLANE_ROTATION_SHARE = 0.4
 """Largest share of all matches that one rotation may explain where the scene is a plane: an image that turns
 before a lens with a wrong distortion looks like a plane, and has 0.45 or more."""
+_MAX_TURN_DEG = 20.0
+"""Largest rotation, in degrees, between the two views of a start: an unknown distortion of k1 = 0.2 has
+parallax in a rotation by 25 degrees and more."""
 _MIN_MOTION_MATCHES = 8
 """Fewest matches to which a homography or a rotation is fitted; either fits fewer by chance."""
 _THIRD_VIEW_PARALLAX_DEG = 0.5
@@ -152,6 +155,10 @@ def start_from_two_views(
             f"the camera has moved too little: {median_deg:.1f} of {min_parallax_deg:g} deg of parallax, "
             f"{wide_deg:.1f} of {_WIDE_PARALLAX_DEG:g} deg at the sides"
         )
+    elif rotation_angle_deg(rotation) > _MAX_TURN_DEG:
+        reason = (
+            f"the camera has turned by {rotation_angle_deg(rotation):.0f} of at most {_MAX_TURN_DEG:g} deg"
+        )
     else:
         plane_share, two_motions_share = _explain_by_motions(first[rows], second[rows], camera)
         is_plane, is_narrow = plane_share >= _MIN_PLANE_SHARE, median_deg < min_parallax_deg
@@ -237,11 +244,11 @@ def _describe_standstill(
             f"the camera does not move: {100 * unmoved_share:.0f} % of {len(first)} matches moved by less "
             f"than {_EXPLAINED_PX:g} px"
         )
-    rotation = fit_rotation(first, second, camera, inlier_px=_EXPLAINED_PX)
-    turned_share = float((rotation.errors_px <= _EXPLAINED_PX).mean())
+    fit = fit_rotation(first, second, camera, inlier_px=_EXPLAINED_PX)
+    turned_share = float((fit.errors_px <= _EXPLAINED_PX).mean())
     if turned_share > max_rotation_share:
         return (
-            f"the camera only turns: a rotation of {rotation.angle_deg:.1f} deg explains "
+            f"the camera only turns: a rotation of {rotation_angle_deg(fit.R_second_first):.1f} deg explains "
             f"{100 * turned_share:.0f} % of {len(first)} matches"
         )
     return ""

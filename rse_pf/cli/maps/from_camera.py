@@ -441,5 +441,6 @@ def _advice(
     if findings:
         return f"settle the finding {findings[0]['name']} first: {findings[0]['hint']}"
     if mapper.keyframes == 0 and not source.has_depth and not source.has_stereo:
-        return "without depth the camera must move, not only turn, over texture; or use a depth camera"
+        advice = "without depth the camera must move, not only turn, over texture; or use a depth camera"
+        return f"{mapper.start_reason}; {advice}" if mapper.start_reason else advice
     return f"move more slowly, and compare the intrinsics with the camera; {FRAMES_FILE} has the reasons"

@@ -152,6 +152,8 @@ def _run_of(
     trajectory, is_metric = mapper.trajectory, mapper.scale.startswith("metric")
     body = drive.dataset.T_body_camera
     errors, why = score(trajectory, drive, is_metric=is_metric, T_body_camera=body)
+    if mapper.start_reason:
+        why = f"no frame has a pose: {mapper.start_reason}"
     arrived = [
         (stamp_s, pose) for stamp_s, segment, pose in tracked if segment == _FIRST and pose is not None
     ]

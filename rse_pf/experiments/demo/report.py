@@ -44,6 +44,7 @@ def make_report(
         "frames": sum(robot.frames for robot in finished),
         "lost_frames": sum(robot.lost_frames for robot in finished),
         "frames_before_start": sum(robot.frames_before_start for robot in finished),
+        "not_started_because": [robot.not_started_because for robot in finished],
         "keyframes": sum(robot.keyframes for robot in finished),
         "weak_poses": sum(robot.weak_poses for robot in finished),
         "truth": finished[0].truth_kind,
@@ -117,6 +118,8 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
         third = f"failed: {_without_pose(report)} of {counted(report['frames'], 'frame')} have no pose\n"
         if report["frames_before_start"]:
             third += "a camera without depth begins once it has moved, not only turned, over texture\n"
+    for number, reason in enumerate(report.get("not_started_because", ()), start=1):
+        third += f"robot {number} has no pose: {reason}\n" if reason else ""
     if "merged" in report:
         third += merged_lines(report["merged"])
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "

@@ -149,6 +149,8 @@ class RobotFinished:
     truth_kind: str
     frames_before_start: int = 0
     """Frames of a camera without depth before it had moved enough."""
+    not_started_because: str = ""
+    """Why a camera without depth has no pose at all; empty if it has."""
     stats: dict[str, Any] = field(default_factory=dict)
     is_metric: bool = True
     check: dict[str, Any] | None = None
@@ -262,6 +264,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 frames=mapper.frames,
                 lost_frames=mapper.lost_frames,
                 frames_before_start=mapper.frames_before_start,
+                not_started_because=mapper.start_reason,
                 keyframes=mapper.keyframes,
                 weak_poses=drive.weak_poses,
                 map_points=len(mapper.map),

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from client_sdk.frontend import Frame
+from client_sdk.mapper import Mapper
 from client_sdk.simulator.renderer import Renderer, add_image_noise
 from client_sdk.simulator.world import make_world
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3
+from tests.client_sdk.live.fake_live_map import solve
+from tests.client_sdk.mapper.flat_world import frame_at, tracked
 from tests.client_sdk.tracking.driving import run_all
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -49,7 +53,7 @@ def test_a_lens_that_drives_forward_or_backwards_is_posed_from_its_first_frame(s
 
     done = run_all(tracker, frames(images(poses)))
 
-    first = next(number for number, tracked in enumerate(done, start=1) if tracked.status == "tracked")
+    first = next(number for number, each in enumerate(done, start=1) if each.status == "tracked")
     assert first <= 8
     assert tracker.segments == (0,)
     path = tracker.trajectory()
@@ -70,8 +74,17 @@ def test_a_lens_that_stands_or_only_turns_has_no_pose_and_says_so(twist: list[fl
 
     done = run_all(tracker, frames(images(moved(twist, 20))))
 
-    assert {tracked.status for tracked in done} == {"starting"}
+    assert {each.status for each in done} == {"starting"}
     assert done[-1].reason.startswith(reason)
+
+
+def test_the_report_of_a_lens_that_stands_says_why_it_has_no_pose() -> None:
+    mapper = Mapper(ask=solve)
+
+    tracked(mapper, (replace(frame_at(0, depth=False), timestamp_s=row / RATE_HZ) for row in range(4)))
+
+    assert mapper.report()["frames_before_start"] == 4
+    assert mapper.report()["not_started_because"].startswith("the camera does not move")
 
 
 def test_a_thing_that_passes_before_a_lens_that_stands_is_no_start() -> None:
@@ -87,5 +100,5 @@ def test_a_thing_that_passes_before_a_lens_that_stands_is_no_start() -> None:
     tracker = MonocularTracker()
     done = run_all(tracker, frames(passing()))
 
-    assert {tracked.status for tracked in done} == {"starting"}
+    assert {each.status for each in done} == {"starting"}
     assert "does not move" in done[-1].reason
