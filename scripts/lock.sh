@@ -15,7 +15,8 @@ every="--universal --python-version 3.10"
 # shellcheck disable=SC2086
 {
   lock demo pyproject.toml $every --extra demo --group build
-  lock dev pyproject.toml $every --extra local --extra aws --extra batch --extra bags --extra experiments --group dev
+  lock dev pyproject.toml $every --extra local --extra aws --extra batch --extra bags --extra calibrate \
+    --extra experiments --group dev
   # What one .venv holds beside the packages of developers has the same versions as they.
   lock ci pyproject.toml $every --group ci --constraint locks/dev.txt
   lock tools $every --group tools

@@ -101,16 +101,25 @@ _FIELDS = {
     *_COEFFICIENT_NAMES,
 }
 """Names of the fields that are read, after `_FIELD_ALIASES` has replaced the names of other programs."""
-_REMARKS = {"name", "comment", "description", "source", "serial", "camera_name", "depth_unit"}
+_REMARKS = {
+    "name",
+    "comment",
+    "description",
+    "source",
+    "serial",
+    "camera_name",
+    "depth_unit",
+    "standard_deviations",
+}
 """Fields of ``intrinsics.json`` for people: they may have any value, which is not used."""
 INTRINSICS_HINT = (
     "write fx fy cx cy width height, and distortion [k1 k2 p1 p2 k3] and depth_scale if they are known, as "
     "JSON into intrinsics.json; files of OpenCV, ROS, ORB-SLAM and COLMAP hold them (docs/cameras.md)"
 )
 TYPICAL_HINT = (
-    "calibrate: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25 (docs/cameras.md); a typical fx "
-    "and fy in that file is a guess that bends the map: Kinect 525 and RealSense D435 615 px at 640x480; "
-    "phones 0.8 and webcams 0.9 of the width"
+    "calibrate by the motion in the recording: rse-pf camera calibrate SOURCE; or with --board 9x6 "
+    "--square-mm 25 (docs/cameras.md); a typical fx and fy in that file is a guess that bends the map: "
+    "Kinect 525 and RealSense D435 615 px at 640x480; phones 0.8 and webcams 0.9 of the width"
 )
 
 

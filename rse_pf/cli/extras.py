@@ -82,6 +82,9 @@ EXTRAS: dict[str, Extra] = {
     "realsense": Extra(
         modules=_same("pyrealsense2"), enables="Intel RealSense cameras", includes=("vision",)
     ),
+    "calibrate": Extra(
+        modules=_same("pycolmap"), enables="calibration of a camera without a board", includes=("vision",)
+    ),
     "maps": Extra(modules=_same("gtsam", "small_gicp"), enables="merging maps, localising in maps, clouds"),
     "batch": Extra(
         modules=_same("distributed"), enables="merges in parts, by several processes or machines",
@@ -121,6 +124,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "map publish": ("keys", "maps"),
     "audit": (),
     "camera": ("vision",),
+    "camera calibrate without --board": ("calibrate",),
     "cloud": ("aws",),
     "settings": (),
     "doctor": (),

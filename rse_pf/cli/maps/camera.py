@@ -1,13 +1,14 @@
 """Calibrate a camera, print a board for it, or check what a camera gives.
 
-SOURCE is a device number (0), a video, or images; check takes folders and recordings as well.  calibrate
-writes intrinsics.json, which every command that opens a camera reads.  A board of 9x6 has 9 by 6 inner
-corners.
+SOURCE is a device number (0), a video, images, a folder or a recording.  calibrate writes intrinsics.json,
+which every command that opens a camera reads.  With --board it looks for a board; a board of 9x6 has 9 by 6
+inner corners.  Without, it calibrates by what a moving camera sees, such as an old recording.
 
 examples:
   rse-pf camera board --board 9x6 --square-mm 25 --out board.pdf
   rse-pf camera calibrate 0 --board 9x6 --square-mm 25 --out intrinsics.json
   rse-pf camera calibrate images/*.png --board 9x6 --square-mm 25
+  rse-pf camera calibrate drive.mp4
   rse-pf camera calibrate --stereo 0 2 --board 9x6 --square-mm 25 --out rig.json
   rse-pf camera check 0
 """
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rse_pf.cli.extras import require
 from rse_pf.cli.maps.frame_table import named_frames
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
@@ -44,16 +46,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions and their options."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     board = argparse.ArgumentParser(add_help=False)
-    board.add_argument("--board", default="9x6", metavar="CxR", help="inner corners (default: %(default)s)")
-    board.add_argument(
-        "--square-mm", type=float, default=25.0, metavar="MM", help="edge of a square (default: 25)"
+    board.add_argument("--board", metavar="CxR", help="inner corners of the board (default: 9x6)")
+    board.add_argument("--square-mm", type=float, metavar="MM", help="edge of a square (default: 25)")
+    calibrate = actions.add_parser(
+        "calibrate",
+        parents=[board],
+        help="write the intrinsics of a camera, by a board or, without --board and --square-mm, by motion",
     )
-    calibrate = actions.add_parser("calibrate", parents=[board], help="write the intrinsics of a camera")
     calibrate.add_argument(
         "sources",
         nargs="+",
         metavar="SOURCE",
-        help="a device number, a video, or images; with --stereo two of them",
+        help="a device number, a video, images or a recording; with --stereo two of them, which see a board",
     )
     calibrate.add_argument(
         "--stereo", action="store_true",
@@ -83,29 +87,36 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _check(args)
     from client_sdk.cameras.board import Board, write_board
 
-    board = Board.parse(args.board, args.square_mm)
+    has_board = args.board is not None or args.square_mm is not None
+    square_mm = 25.0 if args.square_mm is None else args.square_mm
+    board = Board.parse(args.board or "9x6", square_mm)
     if args.action == "calibrate":
-        return _calibrate(args, board)
+        return _calibrate(args, board if has_board or args.stereo else None)
     write_board(args.out, board)
     show(
-        f"{args.out}: {board.columns}x{board.rows} inner corners, squares of {args.square_mm:g} mm",
+        f"{args.out}: {board.columns}x{board.rows} inner corners, squares of {square_mm:g} mm",
         "print it at 100 %, measure a square, and fix it to something flat",
     )
     return 0
 
 
-def _calibrate(args: argparse.Namespace, board: Board) -> int:
-    from client_sdk.cameras.calibration import BoardViews, calibrate
-    from client_sdk.rigs.intrinsics import write_intrinsics
-
+def _calibrate(args: argparse.Namespace, board: Board | None) -> int:
+    """Calibrate by views of *board*, or by the motion of the camera without a board."""
     if args.out is None:
         args.out = Path("rig.json" if args.stereo else "intrinsics.json")
     if not args.max_rms_px > 0:
         raise UsageError(f"--max-rms-px {args.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
     if not args.out.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
-    if args.stereo:
-        return _calibrate_stereo(args, board)
+    if board is None:
+        return _calibrate_from_motion(args)
+    return _calibrate_stereo(args, board) if args.stereo else _calibrate_with_board(args, board)
+
+
+def _calibrate_with_board(args: argparse.Namespace, board: Board) -> int:
+    from client_sdk.cameras.calibration import BoardViews, calibrate
+    from client_sdk.rigs.intrinsics import write_intrinsics
+
     views = BoardViews(board)
     is_live = len(args.sources) == 1 and args.sources[0].isdigit()
     for image in _raw_images(args.sources):
@@ -124,6 +135,40 @@ def _calibrate(args: argparse.Namespace, board: Board) -> int:
         f"{args.out}: fx {camera.fx:.2f}  fy {camera.fy:.2f}  cx {camera.cx:.2f}  cy {camera.cy:.2f}, "
         f"{camera.width}x{camera.height} px",
         f"reprojection error {calibration.rms_px:.3f} px rms over {calibration.views} views",
+    )
+    return 0
+
+
+def _calibrate_from_motion(args: argparse.Namespace) -> int:
+    from client_sdk.cameras.self_calibration import calibrate_from_motion
+    from client_sdk.cameras.view_selection import select_views
+    from client_sdk.rigs.intrinsics import intrinsics_to_json, write_json
+
+    require("camera calibrate without --board")
+
+    def on_progress(step: str) -> None:
+        show_progress(f"{len(views)} views of {images} images: {step}", is_over=False)
+
+    views, images = select_views(itertools.islice(_raw_images(args.sources), _LIVE_IMAGES))
+    found = calibrate_from_motion(
+        views,
+        max_rms_px=args.max_rms_px,
+        depth_scale=args.depth_scale,
+        on_progress=on_progress,
+    )
+    deviations = found.standard_deviations
+    stated = {name: float(f"{value:.3g}") for name, value in deviations.items()}
+    write_json(args.out, intrinsics_to_json(found.intrinsics) | {"standard_deviations": stated})
+    camera, distortion = found.intrinsics.camera, found.intrinsics.distortion
+    centre = "in the middle of the image, not estimated"
+    if "cx" in deviations:
+        centre = f"+- {deviations['cx']:.1f} and {deviations['cy']:.1f}"
+    show(
+        f"{args.out}: fx = fy = {camera.fx:.1f} +- {deviations['f']:.1f} px, "
+        f"cx {camera.cx:.1f}, cy {camera.cy:.1f} ({centre}), {camera.width}x{camera.height} px",
+        f"k1 {distortion[0]:.4f} +- {deviations['k1']:.4f}, k2 {distortion[1]:.4f} +- {deviations['k2']:.4f}",
+        f"reprojection error {found.intrinsics.rms_px:.3f} px rms over {found.intrinsics.views} views "
+        f"of {images} images",
     )
     return 0
 
@@ -176,16 +221,16 @@ def _raw_pairs(sources: list[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.
 
 
 def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
-    """Yield grey images as the lens gives them."""
+    """Yield grey images as the lens gives them; of a recording those of its first or left camera."""
+    from client_sdk.cameras.folder import list_folder
     from client_sdk.cameras.opencv_video import open_video
-    from client_sdk.datasets.images import image_files, is_image, read_colour
+    from client_sdk.datasets.images import is_image, read_colour
 
-    paths = [
-        path
-        for word in sources
-        for path in (image_files(Path(word)) if Path(word).is_dir() else [Path(word)])
-        if is_image(path)
-    ]
+    paths: list[Path] = []
+    for word in sources:
+        euroc = Path(word) / "mav0" / "cam0" / "data"
+        folder = euroc if euroc.is_dir() else Path(word)
+        paths += list_folder(folder).images if folder.is_dir() else [folder] if is_image(folder) else []
     for path in paths:
         yield _gray(read_colour(path))
     if paths:

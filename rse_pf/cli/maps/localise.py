@@ -128,7 +128,7 @@ def _lens_of(args: argparse.Namespace) -> PhotoLens:
     if (args.intrinsics is None) == (args.camera is None):
         raise UsageError(
             "a platform needs --intrinsics FILE, or --camera FX,FY,CX,CY, and not both",
-            hint="make a file: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25",
+            hint="make a file: rse-pf camera calibrate SOURCE, without or with a board (docs/cameras.md)",
         )
     if args.camera is not None:
         fx, fy, cx, cy = _four_numbers(args.camera)
