@@ -186,12 +186,12 @@ class BlockingMapper:
 
     @property
     def map(self) -> PointMap:
-        """The map of segment 0 so far; see `Mapper.map`."""
+        """The map so far of segment 0, the first one, and of all segments joined to it; see `Mapper.map`."""
         return self.mapper.map
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of segment 0 so far; see `Mapper.trajectory`."""
+        """Poses so far of segment 0, the first one, and of all segments joined to it; see `Mapper`."""
         return self.mapper.trajectory
 
     @property

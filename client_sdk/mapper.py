@@ -9,8 +9,8 @@ zero, or ``depth=False``) is tracked by `client_sdk.tracking.monocular_tracker.M
 until odometry, a marker or an IMU gives the metric scale.
 
 **Segment.**  A part of the drive whose poses are in one world.  After tracking was lost for too long the
-tracker begins another segment, with a world of its own.  Segment 0 is the trajectory and the map that users
-see.
+tracker begins another segment, with a world of its own.  Segment 0, the first one, goes on after a loss when
+one of its places is recognised; it is the trajectory and the map that users see.
 
 **Join.**  When the camera, in a newer segment, recognises a place of an older segment, the newer segment is
 moved into the world of the older one: poses, cloud and keyframes.
@@ -169,7 +169,7 @@ class Mapper:
             UsageError: An argument that must be a function is none, or *features* has no name.
         """
         self.camera = camera
-        """Intrinsics of the frames; None before the first frame."""
+        """Intrinsics of all frames: the argument *camera*, else those of the first frame, and None before."""
         self.T_body_camera: Array | None = None
         """Pose ``(4, 4)`` of the camera in the body frame of its rig, metres; None without a rig."""
         self._ask = ask
@@ -217,7 +217,7 @@ class Mapper:
             ConfigurationError: The function that answers pose queries cannot work, such as without a package.
         """
         async with self._frame_lock:
-            # 1. Refuse a frame that cannot follow the one before.
+            # 1. Refuse a frame of another camera, of an earlier time, or with impossible depths.
             self._check(frame)
             if self._recorder is not None:
                 self._recorder.record_frame(frame.timestamp_s, frame.rgb)
@@ -254,8 +254,9 @@ class Mapper:
 
     @property
     def map(self) -> PointMap:
-        """Points of segment 0 so far: depth readings, features of stereo pairs, or monocular landmarks.
+        """Points so far of segment 0 and of all segments that were joined to it.
 
+        They are depth readings, features of stereo pairs, or landmarks of a camera without depth.
         With depth this is the map itself: later frames are added to it.  A turn of the world or an adjustment
         makes another map, and one that was returned before gets no more frames.  Of a camera without depth it
         is made anew from the landmarks at each access, and later frames do not change it.
@@ -392,6 +393,7 @@ class Mapper:
         """Return the figures of the drive, which `save` writes to ``report.json``.
 
         ``map_points`` is the number of all voxels of the map, but in ``report.json`` of the saved ones only.
+        Because `save` adjusts the keyframes first, other figures may differ from those before it as well.
         """
         trips = np.array(self._round_trips_ms)
         trajectory, separate = self.trajectory, self._separate_segments()
@@ -546,9 +548,12 @@ class Mapper:
     # --- Check of each frame, and choice of the tracker by the first one ---
 
     def _check(self, frame: Frame) -> None:
-        """Raise UsageError for a frame that cannot follow the one before, else note its camera and time.
+        """Note camera and time of a frame that can be tracked.
 
-        A refused frame changes nothing.
+        Raises:
+            UsageError: The frame is of another camera than the mapper or the frames before, not later than
+                the frame before, or, without a stereo pair, the median of its depths is impossible in metres;
+                such a frame changes nothing.
         """
         own, camera = frame.camera, self.camera or frame.camera
         if own != camera:

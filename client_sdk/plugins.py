@@ -317,7 +317,7 @@ class OptimiserPlugin:
     """A user's bundle adjustment with its checks; takes the place of `client_sdk.monocular.bundle.adjust`."""
 
     def __init__(self, function: OptimiserFunction) -> None:
-        """Wrap a function; raises UsageError if it cannot be called."""
+        """Wrap a function that adjusts a bundle; raises UsageError if it cannot be called."""
         self._function = _check_callable("optimiser", function)
 
     def __call__(self, bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:

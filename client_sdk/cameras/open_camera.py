@@ -75,8 +75,8 @@ def open_camera(
         depth: Whether depth is read if the source has depth.
         camera: ``left`` uses only the left camera of a stereo pair, ``stereo`` refuses a source that is no
             stereo pair; None uses both cameras if there are two.
-        imu: Whether frames have samples of an IMU, which only recordings can have; with True, a source
-            without an IMU is refused; None means yes if there is one.
+        imu: Whether frames have samples of an IMU, which only recordings can give; with True, a source that
+            is no recording, or a recording without an IMU, is refused; None means yes if a recording has one.
 
     Raises:
         UsageError: There is no such source, its intrinsics are missing or of the wrong kind, it is not what
@@ -92,7 +92,10 @@ def open_camera(
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
     if imu and not is_recording(path):
-        raise UsageError(f"{word} has no IMU", hint="leave out imu=True, or --imu")
+        raise UsageError(
+            f"{word} is no recording, and only recordings can give samples of an IMU",
+            hint="leave out imu=True, or --imu",
+        )
     # 2. Open two folders of a stereo pair, or a RealSense camera.
     if pair_folders(path) is not None:
         if own is not None and not (isinstance(own, Rig) and own.right is not None):

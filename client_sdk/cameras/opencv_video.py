@@ -29,7 +29,9 @@ assumed."""
 _MAX_RATE_HZ = 1000.0
 """Largest rate of a file that is used; a larger one is a mistake of its container, and 30 Hz are assumed."""
 _ASSUMED_RATE_HZ = 30.0  # rate of a file that states none, or one outside of these limits
-_TEXT_PROBE_BYTES = 64  # a file whose first bytes, this many, are printable is refused as a text
+_TEXT_PROBE_BYTES = 64
+"""Number of first bytes of a file that are checked.  A file of which all are printable, or which is empty, is
+refused as a text, since OpenCV would open the files that a playlist names.  YUV4MPEG2 videos are accepted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -91,6 +91,7 @@ def decode_reply(data: bytes, reply_type: type[T]) -> T:
         plain = msgspec.msgpack.decode(data, ext_hook=extension_hook)
     except msgspec.DecodeError as error:
         raise BadMessage(
-            "these bytes are not a reply", hint="download the object that answer.object names"
+            "the data given to decode_reply are not a reply",
+            hint="download the object that answer.object names",
         ) from error
     return as_type(plain, reply_type)

@@ -149,7 +149,13 @@ class UserCallbacks:
         )
 
     def report(self, name: str, error: BaseException, *, has_traceback: bool = True) -> None:
-        """Count *error* of the user function *name*; log each type of error once for each source line."""
+        """Add 1 to `errors`, and log *error* if the same type has not been logged for its source line before.
+
+        Args:
+            name: The user function that raised *error*, as the log names it.
+            error: What the function raised.
+            has_traceback: Whether the log entry has the traceback of *error*.
+        """
         frames = traceback.extract_tb(error.__traceback__)
         source_line = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
         if self._count((name, type(error).__name__, source_line)):

@@ -479,10 +479,11 @@ class _State:
 class _NormalEquations:
     """Block tridiagonal normal equations with a border, solved by block elimination.
 
-    For n states of 15 unknowns and a border of m unknowns: ``diagonal`` ``(n, 15, 15)``, ``coupling``
-    ``(n - 1, 15, 15)`` of each state with the next, ``border`` ``(n, 15, m)`` of each state with the border,
-    ``corner`` ``(m, m)`` of the border with itself, and the gradients (Jacobian transposed times residuals)
-    ``(n, 15)`` and ``(m,)``.
+    A state holds the 15 unknowns of one pose: rotation, position, velocity and both biases.  The border holds
+    the m unknowns that all poses share: two angles of gravity, and the logarithm of the scale unless the
+    poses are metric.  For n states: ``diagonal`` ``(n, 15, 15)``, ``coupling`` ``(n - 1, 15, 15)`` of each
+    state with the next, ``border`` ``(n, 15, m)`` of each state with the border, ``corner`` ``(m, m)`` of the
+    border with itself, and the gradients (Jacobian transposed times residuals) ``(n, 15)`` and ``(m,)``.
     """
 
     def __init__(self, n: int, m: int) -> None:
@@ -514,7 +515,8 @@ class _NormalEquations:
         *damping* is the fraction of each diagonal element that is added to it for this solution; the stored
         equations do not change.
         """
-        # 1. Eliminate all states, so that equations of the border alone remain.
+        # 1. Eliminate the states of all poses (rotation, position, velocity and biases), so that equations of
+        #    the border alone (the scale and the direction of gravity) remain.
         eliminated: list[Array] = []
         D, C, G, b, c = self._eliminate_all_but_last(damping, eliminated)
         solved = np.asarray(np.linalg.solve(D, np.column_stack([b, C])), dtype=np.float64)

@@ -1,4 +1,7 @@
-"""Collect the samples of an IMU in the order of time, and return those of any interval."""
+"""Collect the samples of an IMU in the order of time, and return those of an interval.
+
+Only the last five minutes are held, and an interval in which too many samples are missing has no result.
+"""
 
 from __future__ import annotations
 

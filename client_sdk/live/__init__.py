@@ -13,11 +13,11 @@ map and back:
 5. `attachments` uploads the attachments to the object store, after pose queries and keyframes.
 6. `keyframe_sender` asks for the robot's next keyframe number in the map (``live-show``), and sends the
    oldest keyframe (``live-keyframe``) until the map server acknowledges it, which means that the log of the
-   map holds it durably.
-7. While the segment (the robot's present odometry frame) is not aligned to the map, `relocaliser` also asks
-   where in the map the keyframe was made (``live-relocalise``).
+   map holds it durably.  A keyframe that is refused for its content is removed instead.
+7. While the segment (the robot's present odometry frame) is not aligned to a map that has keyframes of other
+   robots, `relocaliser` also asks, with pauses, where in the map the keyframe was made (``live-relocalise``).
 8. The map server measures loop closures and optimises its pose graph (`rse_pf.live_map`), and publishes the
-   alignment of each segment as an update of the map's topic.
+   alignment of the newest segment of each robot as an update of the map's topic.
 9. `alignments` applies updates and relocalisations, and returns a `Correction` for each change.
 10. `LiveMapper` publishes the correction; from the next frame on, ``T_map_camera`` uses the new alignment.
 

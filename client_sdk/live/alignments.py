@@ -281,7 +281,11 @@ class Alignments:
 
 
 class CorrectionStream:
-    """Pass the corrections of one live map to any number of readers, each of which reads at its own speed."""
+    """Pass the corrections of one live map to any number of readers, each of which reads at its own speed.
+
+    At most 1,000 corrections wait for a reader, so that a slower reader loses the oldest ones; a new reader
+    begins with the last 1,000.
+    """
 
     def __init__(self) -> None:
         self._recent: deque[Correction] = deque(maxlen=_MAX_CORRECTIONS)

@@ -418,8 +418,8 @@ class LiveMapper:
         """The robot's own cloud of its keyframes, each at its pose in its odometry frame, metres.
 
         Alignments are not applied, so the parts of several segments may not fit each other.  The newest
-        keyframe may be missing.  For a camera without depth these are the landmarks of `Mapper.map`, in its
-        unit.
+        keyframe may be missing.  For a camera without depth these are the landmarks of `Mapper.map`, in
+        metres only if the mapper knows the scale.
         """
         return self._mapper.map
 

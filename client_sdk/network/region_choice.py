@@ -28,11 +28,12 @@ MAX_MEASUREMENT_GAP_S = 10.0
 """If a region was not compared for this many seconds, the time for which it has been nearer is counted from 0
 again: the robot may have been suspended."""
 LOSS_MEMORY_S = 3600.0
-"""For this many seconds a lost connection of a region counts as a loss in `MAX_HOLD_DOUBLINGS`, so that a
-robot returns later to a region that loses connections."""
+"""For this many seconds a lost connection to a region counts for `MAX_HOLD_DOUBLINGS`, so that a robot
+returns later to a region that loses connections."""
 MAX_HOLD_DOUBLINGS = 4
-"""The time for which a region must be nearer doubles with each of its losses after the first, at most this
-often: it becomes at most 16 times as long."""
+"""The time for which a region must be nearer before the robot changes to it doubles with each connection to
+the region that was lost in the last hour, except the first one, at most this often: it becomes at most 16
+times as long."""
 
 
 @dataclass(slots=True)

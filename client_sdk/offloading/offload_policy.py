@@ -103,8 +103,9 @@ class CloudFirst:
             robot_can: Whether the robot can compute the service.
             burst_s: Expected time in seconds of an answer of the burst function; None if it cannot be asked.
         """
-        # 1. Compute the latest time at which the robot can start and still meet the deadline.  Leave out the
-        #    burst function if it would probably answer after this time.
+        # 1. Compute the latest time at which the robot starts: the deadline less twice the solving time of
+        #    the robot (0 if it cannot compute the service) and less `slack_s`.  Leave out the burst function
+        #    if it would probably answer after this time.
         local_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
         robot_needs_s = FALLBACK_MARGIN * local_s if robot_can else 0.0
         latest_s = max(0.0, deadline_s - robot_needs_s - self.slack_s)

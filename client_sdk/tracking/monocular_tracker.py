@@ -910,13 +910,16 @@ class MonocularTracker:
         return measured if previous.agrees_with(measured, centre, depth) else None
 
     def _join(self, segment: int, similarity: Similarity, keyframe: int) -> None:
-        """Move all of *segment*, the newer one, into an older one, which keeps its frame and its unit.
+        """Move all of *segment*, the newer one, into an older segment, which keeps its frame and its unit.
+
+        Then the landmarks around the place that both segments show are fused, and the joined map is adjusted,
+        so that poses of the older segment change as well.
 
         Args:
             segment: Number of the newer segment.
-            similarity: Where it lies in the older one.
+            similarity: Where the newer segment lies in the older one.
             keyframe: Keyframe of the newer segment that shows the same place as ``similarity.keyframe``, a
-                keyframe of the older one.
+                keyframe of the older one; the landmarks around these two keyframes are fused.
         """
         newer, into = self._segments.pop(segment), self._segments[similarity.segment]
         newer.move(similarity.T, similarity.scale)

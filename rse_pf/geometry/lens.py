@@ -43,7 +43,8 @@ class LensModel:
         coefficient_counts: Numbers of coefficients that OpenCV's functions for this model take.  A `Lens` may
             also have none, in which case OpenCV receives four zeros.
         is_perspective: Whether the model without coefficients is a pinhole camera.
-        plausible_field_of_view_deg: Smallest and largest field of view of a lens that SLAM can use.
+        plausible_field_of_view_deg: Smallest and largest field of view that is accepted for such a lens; 0
+            and infinity are no limits.
         field_of_view_rad: Maps the quotient of an image side and the focal length, both in pixels, to the
             field of view along this side in radians, without distortion.
         part_of_opencv: Maps the module ``cv2`` to the module with the functions of this model.
@@ -133,7 +134,11 @@ class Lens:
 
     @property
     def plausible_field_of_view_deg(self) -> tuple[float, float]:
-        """The smallest and the largest field of view of a lens of this model that SLAM can use, degrees."""
+        """The smallest and the largest field of view that is accepted for a lens of this model, degrees.
+
+        A source with another one is refused, because its focal length is probably wrong.  A fisheye lens has
+        no limits: 0 and infinity.
+        """
         return LENS_MODELS[self.model].plausible_field_of_view_deg
 
     @property

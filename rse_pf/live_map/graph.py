@@ -448,6 +448,7 @@ class MapGraph:
     def apply(self, decisions: Iterable[Decision]) -> list[Outcome]:
         """Carry out each decision before the next one is made, and return the outcomes of all decisions.
 
+        Decisions concern loop closures, components, segments and reports, and no keyframe is added by one.
         A generator of *decisions* sees the graph as its earlier decisions have changed it.
         """
         return [outcome for decision in decisions for outcome in self._apply(decision)]

@@ -441,7 +441,11 @@ class LiveMap:
         return []
 
     def _add_keyframe(self, event: KeyframeAdded) -> list[Outcome]:
-        """Add a keyframe at the pose that odometry gives it after the newest keyframe of its segment."""
+        """Add a keyframe to the graph and to the index of place recognition.
+
+        Its pose is that of the newest keyframe of its segment, moved by the odometry since then; the first
+        keyframe of a segment keeps its pose in the odometry frame.
+        """
         graph = self._graph
         # 1. Add the keyframe to the graph and to the index of place recognition.
         i = graph.add_keyframe(event)

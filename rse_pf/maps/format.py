@@ -418,7 +418,10 @@ def _decompress(data: bytes, max_bytes: int) -> bytes | bytearray:
     try:
         return inflate_within(data[len(_MAGIC) :], budget)
     except LimitExceeded as error:
-        raise BadRequest(f"the map: {error.message}", hint="send fewer points") from error
+        raise BadRequest(
+            f"the map file cannot be decompressed: its {error.message}",
+            hint="save the map with fewer keyframes or points",
+        ) from error
     except BadMessage as error:
         raise BadRequest(f"the map is truncated or damaged: {error.message}", hint="send it again") from error
 

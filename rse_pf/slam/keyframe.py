@@ -71,8 +71,8 @@ MAX_KEYFRAME_BYTES = 36_000
 33.3 kB.  A larger keyframe is refused."""
 MAX_FEATURES = 894
 """Largest number of features of one keyframe with ORB descriptors; for other kinds of descriptors,
-`max_features` returns the number.  Of more features a robot sends the first ones; a keyframe that holds more
-is refused."""
+`max_features` returns the number.  Of more features a robot sends the first ones that can be encoded; a
+keyframe that holds more is refused."""
 MAX_BLOCKS = 16
 """Largest number of blocks in one encoded keyframe, a keyframe with more is refused: this release knows seven
 kinds of blocks."""

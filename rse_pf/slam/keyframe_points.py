@@ -52,7 +52,9 @@ REFERENCE_BYTES = _REFERENCE_STRUCT.size  # size in bytes of an encoded referenc
 _MAGIC = b"KP"  # the first two bytes of the points of a keyframe
 _VERSION = 1  # version of the encoding of coloured points, the only one that is read and written
 _POINT_BYTES = 9  # size in bytes of an uncompressed point: index 4, depth 2, colour 3
-_MIN_DEPTH_MM = 10  # smallest depth in millimetres of a coloured point; a nearer one is not encoded
+_MIN_DEPTH_MM = 10
+"""Smallest depth in millimetres of a coloured point: a nearer point is not encoded, and encoded points with a
+nearer one are refused."""
 _MAX_DEPTH_MM = 65_535  # largest depth in millimetres that a uint16 holds; a farther point is not encoded
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 

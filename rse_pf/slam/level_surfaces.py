@@ -52,8 +52,9 @@ _TUKEY_LIMITS_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Distances in metres from the plane of the floor at which the weight of a cell becomes 0, for the successive
 iterations of its robust fit."""
 _MIN_INLIER_RATIO = 0.5
-"""Smallest share of the cells that must lie within 5 cm of the plane of the floor; with stairs or several
-storeys in a map, the share is smaller, and the map has no floor."""
+"""Smallest share of the cells (horizontal squares of 0.25 m with one low point each) whose low point must lie
+within 5 cm of the plane of the floor; with stairs or several storeys in a map, the share is smaller, and the
+map has no floor."""
 _MIN_WIDTH_M = 1.0
 """Smallest width in metres of a floor, measured perpendicularly to its longest extent: the tilt of a narrower
 strip is uncertain."""

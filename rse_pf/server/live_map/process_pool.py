@@ -259,7 +259,10 @@ class MapServerPool:
 
     @property
     def is_freeing_process(self) -> bool:
-        """Whether a map server is giving its map up, so that another map can have a process soon."""
+        """Whether a map server is giving its map up, so that another map can have a process soon.
+
+        False while the pool drains: all map servers give their maps up then, and no other map gets a process.
+        """
         return not self.is_draining and any(process.is_releasing for process in self._in_use)
 
     def take(
@@ -337,7 +340,10 @@ class MapServerPool:
             process.release()
 
     def kill_spare(self) -> None:
-        """Kill the spare process, and cancel the timer that would start another one."""
+        """Kill the spare process, and cancel the timer that would start another one.
+
+        This is called when no live map is used any more, and when the pool drains.
+        """
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -255,7 +255,8 @@ class LiveMapRouter(CommandQueue):
         def find_error() -> RsePfError | None:
             """Check a token that the robot has renewed; return an error if it may not read the map.
 
-            If it may only watch the map, from now on no map server is started for this subscription.
+            This is called before each update is sent, and checks each token once.  If the token may only
+            watch the map, from now on no map server is started for this subscription.
             """
             nonlocal checked_claims
             if connection.claims is checked_claims:

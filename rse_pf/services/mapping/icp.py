@@ -69,7 +69,10 @@ def register(registry: Registry) -> None:
 
     @registry.service("icp", limited=True, warm_up=load_small_gicp)
     def icp(request: IcpRequest) -> IcpReply:
-        """Refine the pose between two overlapping point clouds."""
+        """Refine the pose between two overlapping point clouds.
+
+        If the refined pose is refused, the reply has the guess of the request and the reason.
+        """
         target = reshaped("target", request.target, 3)
         source = reshaped("source", request.source, 3)
         if max(len(target), len(source)) > MAX_POINTS:

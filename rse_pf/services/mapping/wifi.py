@@ -47,7 +47,9 @@ _MIN_DBM = -120.0
 _MAX_DBM = 0.0
 
 # --- Calibration of the uncertainty ---
-_RADIUS_PROBABILITY = 0.68  # probability that the true position lies within sigma_m of the reply
+_RADIUS_PROBABILITY = 0.68
+"""Probability that the true position lies horizontally within sigma_m of the reply: sigma_m is this quantile
+of the horizontal distances of the posterior, and the exponent of the likelihood is calibrated by it."""
 # Candidate exponents of the likelihood, ascending: 1 takes the errors of access points as independent.
 _TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 _DEFAULT_TEMPER = 0.4  # exponent of the likelihood where a survey is too small to calibrate the exponent

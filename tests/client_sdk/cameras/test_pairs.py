@@ -107,9 +107,9 @@ def test_images_of_another_size_are_one_line(tmp_path: Path) -> None:
     ("source", "options", "says"),
     [
         ("pair", {"intrinsics": RIG.left.lens}, "is a stereo pair, and the intrinsics of"),
-        ("pair", {"imu": True}, "has no IMU"),
-        ("colours", {"imu": True}, "has no IMU"),
-        ("realsense", {"imu": True}, "realsense has no IMU"),
+        ("pair", {"imu": True}, "is no recording, and only recordings"),
+        ("colours", {"imu": True}, "is no recording, and only recordings"),
+        ("realsense", {"imu": True}, "realsense is no recording, and only recordings"),
         ("realsense", {"camera": "stereo"}, "realsense is one camera with depth"),
         ("realsense", {"intrinsics": RIG}, "realsense is one camera with depth"),
         ("drive.bag", {}, "is a bag"),

@@ -73,7 +73,8 @@ class KeyframeObjects:
         """Use the object store *store* and the tenant's *account*, which is credited for deleted objects."""
         self._store = store
         self._account = account
-        self._cache: dict[str, bytes] = {}  # encoded points, keyed by object name
+        # Encoded points of the last cloud, keyed by object name; the cloud of the next version reuses them.
+        self._cache: dict[str, bytes] = {}
         self._cached_bytes = 0
         self._culled: deque[tuple[str, str]] = deque()
         self._deletions: Counter[tuple[str, str]] = Counter()
