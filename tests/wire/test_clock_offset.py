@@ -50,7 +50,7 @@ def test_the_offset_is_never_further_off_than_half_the_shortest_round_trip(ways,
     for up_s, down_s in ways:
         clock.add(exchange(up_s, down_s, offset_s))
 
-    shortest_s = min(up_s + down_s for up_s, down_s in ways)
+    shortest_s = min(up_s + down_s for up_s, down_s in ways[-8:])  # a clock remembers eight exchanges
     assert abs(clock.offset_s - offset_s) <= 0.5 * shortest_s + 1e-9
 
 
