@@ -101,7 +101,8 @@ class FoundFeatures:
 
 FeaturesFunction = Callable[[npt.NDArray[np.uint8]], FoundFeatures]
 """A feature extractor: takes an ``(h, w, 3)`` uint8 image, red first.  The function's attribute ``name``,
-else its ``__name__``, is the name of the kind of features: maps hold features of one kind only."""
+else its ``__name__``, in lower case, is the name of the kind of features: maps hold features of one kind
+only."""
 MotionFunction = Callable[[Array, Array, float], npt.ArrayLike]
 """A motion model: takes ``(k,)`` times in seconds and ``(k, 4, 4)`` poses ``T_world_camera`` of the newest
 tracked frames, ten at most, oldest first, and the time of the next frame; returns the predicted ``(4, 4)``

@@ -63,8 +63,9 @@ MAX_INTERVAL_S = 1e3
 _MIN_EPOCH_S = 1e9  # smallest median of time stamps that count as seconds since 1970: the year 2001
 _MAX_EPOCH_S = 1e10  # median from which on time stamps do not count as seconds since 1970: the year 2286
 _TIME_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-"""Units among which that of a recording's time stamps is searched, each with its length in seconds: the unit
-is the first by which the time stamps are times since 1970."""
+"""Units that the time stamps of a recording may have, each with its length in seconds.  Time stamps count in
+the first unit by which they are in the years 2001 to 2286, whatever the file's format prescribes; if there is
+none, in the unit of the format, or in that which their median interval suggests (`time_unit_s`)."""
 _USUAL_LOSS_SHARE = 0.1
 """Share of lost images, up to which a loss with `LossFacts.is_usual` is printed as a note and not as a
 finding: of two cameras that are not triggered together, some images always have no partner."""

@@ -53,8 +53,8 @@ class RegionChoice:
         Args:
             count: Number of regions.
             hold_s: How many seconds another region must be clearly nearer before the robot changes to it.
-                It doubles with each loss of that region within the last hour, except the first one, and
-                becomes at most 16 times as long.
+                It doubles with each connection to that region that was lost in the last hour, except the
+                first one, and becomes at most 16 times as long.
         """
         self._regions = [_RegionHistory() for _ in range(count)]
         self._hold_s = hold_s

@@ -444,7 +444,7 @@ class LiveMap:
         """Add a keyframe to the graph and to the index of place recognition.
 
         Its pose is that of the newest keyframe of its segment, moved by the odometry since then; the first
-        keyframe of a segment keeps its pose in the odometry frame.
+        keyframe of a segment keeps its pose in the odometry frame, without depth by the assumed scale.
         """
         graph = self._graph
         # 1. Add the keyframe to the graph and to the index of place recognition.

@@ -356,7 +356,8 @@ class NativeSolver:
             The pose, which may be weak, in new arrays.
 
         Raises:
-            BadRequest: Sizes do not fit, ``n < 4``, or a number is not finite or beyond 1e6.
+            BadRequest: Sizes or options do not fit, ``n < 4``, a number is not finite or beyond 1e6, or
+                memory is short.
             NoConsensus: No pose has more inliers than a random pose would have.
             DegenerateGeometry: The inliers do not determine one pose.
         """
@@ -389,7 +390,8 @@ class NativeSolver:
                 estimate a pose.
 
         Raises:
-            BadRequest: Sizes do not fit, ``n < 4``, or a number is not finite or beyond 1e6.
+            BadRequest: Sizes or options do not fit, ``n < 4``, a number is not finite or beyond 1e6, or
+                memory is short.
         """
         pose = None if T_camera_world is None else aligned(T_camera_world, np.float64)
         if pose is not None and pose.shape != (4, 4):
