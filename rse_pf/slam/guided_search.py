@@ -48,12 +48,10 @@ class MapLandmarks:
 
     Attributes:
         points_map: ``(n, 3)`` metres, finite.
-        origins_map: ``(n, 3)`` metres, for each point the position of the camera that measured it.
         descriptors: ``(n, d)``.
     """
 
     points_map: Array
-    origins_map: Array
     descriptors: Descriptors
 
 
@@ -66,20 +64,19 @@ class GuidedPose:
         covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_camera``, for independent
             errors of the matches.
         solution: The solution of PnP, in the frame of the first pose's camera.
-        matches: All *k* matches, inliers and outliers: landmarks ``(k, 3)`` in the map, the positions
-            ``(k, 3)`` of the cameras that measured them, and pixels ``(k, 2)`` of the view.
+        matches: The number of matches, inliers and outliers.
     """
 
     T_map_camera: Array
     covariance: Array
     solution: PnpSolution
-    matches: tuple[Array, Array, Array]
+    matches: int
 
     @property
     def is_sure(self) -> bool:
         """Whether the pose is ok whatever the number of inliers of single keyframes."""
         inliers = len(self.solution.inliers)
-        is_supported = inliers >= max(_MIN_SURE_INLIERS, _MIN_SURE_RATIO * len(self.matches[2]))
+        is_supported = inliers >= max(_MIN_SURE_INLIERS, _MIN_SURE_RATIO * self.matches)
         return is_supported and not self.solution.reason
 
 
@@ -129,7 +126,7 @@ def search_around(
         T_map_camera=T_map_second,
         covariance=to_map @ solution.covariance @ to_map.T,
         solution=solution,
-        matches=(landmarks.points_map[rows], landmarks.origins_map[rows], view.pixels[feature_rows]),
+        matches=len(rows),
     )
 
 

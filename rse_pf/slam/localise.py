@@ -52,10 +52,12 @@ accepted; photos with a right camera and a rolling shutter stay below 5.1 degree
 _MAX_MAP_COORDINATE_M = 1e6
 """Largest coordinate in metres of a candidate keyframe in the map.  A keyframe beyond it has a false pose,
 since no robot drives 1,000 km; it is ignored, so that it does not make the pose of the view ambiguous."""
-_CAMERA_WEIGHT = 0.25
-"""Factor of the covariance that unknown intrinsics add to that of a pose.  It is below 1 because most stated
-intrinsics are right: with 1, the errors of photos with a right camera are a fifth of the standard deviation.
-With 0.25, three standard deviations are still 1.5 times the shift that a wrong camera causes."""
+_MIN_CAMERA_WEIGHT = 0.25
+"""Smallest factor of the covariance that unknown intrinsics add to that of a pose.  It is below 1 because
+most stated intrinsics are right: with 1, nearly all errors of photos with a right camera are within one
+standard deviation."""
+_DOUBTED_FOCAL_DEVIATIONS = 3.0
+"""Difference of fitted and stated focal length, in standard deviations, from which on that factor is 1."""
 _GUIDED_FLOOR_M = 0.005
 """Standard deviation along each axis, in metres, of the error that all landmarks around a pose have in
 common; its square is added to the variance of a guided search."""
@@ -89,7 +91,7 @@ class LocalisationOptions:
             the reason is "ambiguous": a view shows less than a room, and so cannot tell the rooms apart.
         fits_camera: Whether to fit a camera to the matches of a view without depths, because its stated
             intrinsics may be wrong, as those of a photo.  The verdict is then ok only if the fitted camera
-            has nearly the stated focal length and nearly the same pose, and the covariance includes a quarter
+            has nearly the stated focal length and nearly the same pose, and the covariance includes a share
             of the squared difference of both poses.
     """
 
@@ -229,11 +231,11 @@ def localise(
         covariance = guided.covariance + _guided_floor(T_map_camera)
         if reason in _FEW_MATCHES and guided.is_sure:
             reason = ""
-    # 6. Enlarge the covariance if the camera may be wrong.
+    # 6. Enlarge the covariance if the camera may be wrong.  The camera is fitted to the matches of the first
+    # pose, since a guided search finds only those that suit the stated camera.
     if options.fits_camera and view.depths_m is None:
-        matches = _collect_matches(agreeing) if guided is None else guided.matches
-        fit = fit_camera(*matches, T_map_camera, view.camera)
-        covariance = covariance + _CAMERA_WEIGHT * _camera_covariance(fit, T_map_camera)
+        fit = fit_camera(*_collect_matches(agreeing), T_map_camera, view.camera)
+        covariance = covariance + _camera_covariance(fit, T_map_camera)
         reason = reason or _camera_weakness(fit, T_map_camera)
     scale = None if view.is_metric else _estimate_scale(agreeing, options)
     if scale is None and not view.is_metric:
@@ -355,10 +357,13 @@ def _camera_covariance(fit: CameraFit, T_map_camera: Array) -> Array:
     """Return the ``(6, 6)`` covariance that an unknown error of the intrinsics adds to that of a pose.
 
     It is of the twist on the left of *T_map_camera*: the outer product of the difference between the fitted
-    and the given pose, plus the covariance of the fitted one.
+    and the given pose, plus the covariance of the fitted one, both times a weight.  The weight grows with the
+    difference between fitted and stated focal length.
     """
+    doubt = abs(fit.log_focal) / (_DOUBTED_FOCAL_DEVIATIONS * fit.log_focal_deviation)
+    weight = min(1.0, max(_MIN_CAMERA_WEIGHT, doubt**2))
     difference = log_se3((fit.T_map_camera @ inverse(T_map_camera))[None])[0]
-    return np.outer(difference, difference) + fit.covariance
+    return weight * (np.outer(difference, difference) + fit.covariance)
 
 
 def _camera_weakness(fit: CameraFit, T_map_camera: Array) -> str:

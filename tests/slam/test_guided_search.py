@@ -44,10 +44,8 @@ def search(first: Array, count: int | None = None) -> GuidedPose | None:
     landmarks = [landmarks_of_keyframe(keyframe) for keyframe in MAP]
     poses = [keyframe.T_world_camera for keyframe in MAP]
     points = [transform(T, found.points_camera) for T, found in zip(poses, landmarks, strict=True)]
-    origins = [np.tile(T[:3, 3], (len(of), 1)) for T, of in zip(poses, points, strict=True)]
     around = MapLandmarks(
         points_map=np.concatenate(points)[:count],
-        origins_map=np.concatenate(origins)[:count],
         descriptors=np.concatenate([found.descriptors for found in landmarks])[:count],
     )
     return search_around(first, around, VIEW, min_inliers=7, inlier_px=6.0)

@@ -214,9 +214,6 @@ def _landmarks_around(
         points_map=np.concatenate(
             [transform(poses[row], found.points_camera) for row, found in zip(chosen, landmarks, strict=True)]
         ),
-        origins_map=np.repeat(
-            poses[chosen][:, :3, 3], [len(found.descriptors) for found in landmarks], axis=0
-        ),
         descriptors=np.concatenate([found.descriptors for found in landmarks]),
     )
 
