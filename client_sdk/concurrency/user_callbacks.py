@@ -149,12 +149,12 @@ class UserCallbacks:
         )
 
     def report(self, name: str, error: BaseException, *, has_traceback: bool = True) -> None:
-        """Add 1 to `errors`, and log *error* if the same type has not been logged for its source line before.
+        """Add 1 to `errors`; log *error* if its type was not yet logged for *name* and the source line.
 
         Args:
             name: The user function that raised *error*, as the log names it.
             error: What the function raised.
-            has_traceback: Whether the log entry has the traceback of *error*.
+            has_traceback: Whether the log entry includes the traceback of *error*.
         """
         frames = traceback.extract_tb(error.__traceback__)
         source_line = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""

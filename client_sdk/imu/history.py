@@ -12,7 +12,9 @@ from rse_pf.geometry import Array
 
 __all__ = ["ImuHistory"]
 
-_KEPT_S = 300.0  # samples older than this are dropped, so that the memory of a long drive is bounded
+_KEPT_S = 300.0
+"""Samples more than this many seconds before the newest sample are dropped, so that the memory of a long
+drive is bounded."""
 _MAX_GAP_INTERVALS = 5.0
 """Longest time between two successive samples, in sampling intervals, over which they are interpolated: after
 a longer time too many samples are missing, and the motion is unknown."""

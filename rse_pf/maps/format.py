@@ -67,17 +67,17 @@ _MAX_COMPRESSION_RATIO = 50.0
 """Largest accepted ratio of the decompressed to the compressed size of a map file: features and point clouds
 compress to half their size only, so that a file with a larger ratio is hostile, and is refused."""
 _UNCHECKED_BYTES = 1 << 20
-"""Decompressed size in bytes up to which a map file may have any compression ratio: 1 MiB of memory harms
-nobody."""
+"""Decompressed size in bytes up to which a map file may have any compression ratio, because 1 MiB of memory
+harms nobody; a larger file is refused beyond `_MAX_COMPRESSION_RATIO`."""
 _MAX_ID = 2**63 - 1  # the largest id of a keyframe, an int64; a keyframe with a larger one is refused
 # Largest number of characters of the name of a keyframe's robot; a keyframe with a longer one is refused.
 _MAX_NAME_LENGTH = 64
 _MAX_COORDINATE_M = 1e9
-"""Largest absolute coordinate in metres of a point in a map, beyond any map; far larger ones would overflow
-float32 when they are squared."""
+"""Largest absolute coordinate in metres of a point in a map, beyond any map; a map with a larger one is
+refused, because far larger ones would overflow float32 when they are squared."""
 _MAX_TIME_S = 1e12
 """Largest absolute time of a keyframe in Unix seconds: far beyond any clock, and float64 still resolves
-0.2 ms."""
+0.2 ms.  A keyframe with a larger one is refused."""
 # Largest absolute coordinate of a feature in pixels, since no camera has wider images; a keyframe with a
 # larger one is refused.
 _MAX_PIXEL = 1e5
@@ -363,7 +363,8 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | Non
         limits: The largest numbers of keyframes, features and edges; None means the defaults.
 
     Raises:
-        BadRequest: The bytes are not a map, are damaged, or decompress to more than *max_bytes*.
+        BadRequest: The bytes are not a map, are damaged, or decompress to more than *max_bytes*, or to more
+            than 1 MiB and 50 times their size.
         LimitExceeded: The map holds more than *limits* allow.
     """
     limits = limits or MapLimits()

@@ -139,7 +139,7 @@ def decode_points(data: bytes, camera: Camera) -> tuple[Array, Colours]:
 
     Raises:
         BadRequest: *data* is longer than 160,000 bytes or malformed, holds more than 16,000 points, or a
-            point outside the image.
+            point outside the image or nearer than 10 mm.
     """
     # 1. Check the head, and decompress no more bytes than the stated number of points has.
     if not _HEAD_STRUCT.size <= len(data) <= MAX_POINTS_BYTES:

@@ -258,7 +258,11 @@ def register(registry: Registry) -> None:
 
     @registry.service("wifi", limited=True)
     def wifi(request: WifiRequest) -> WifiReply:
-        """Find the position of a robot by the Wi-Fi access points that it receives."""
+        """Find the position of a robot by the Wi-Fi access points that it receives.
+
+        The request brings the survey along.  If the survey has too few access points of the scan, the reply
+        has ``found`` false and the reason.
+        """
         if len(request.survey) > MAX_FINGERPRINTS:
             raise LimitExceeded(
                 f"{len(request.survey)} fingerprints are above {MAX_FINGERPRINTS}",
