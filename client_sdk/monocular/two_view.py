@@ -41,6 +41,9 @@ _MAX_ROTATION_SHARE_AT_SIDES = 0.5
 _MIN_PLANE_SHARE = 0.9
 """Share of the inlier matches from which one homography explains the scene: 0.92 to 1.0 for planes, 0.4 to
 0.9 for streets and rooms.  The relative pose of a plane has two solutions, and needs more parallax."""
+_MIN_STILL_SHARE = 0.03
+"""Share of the inlier matches that lie off a plane and did not move from which they are a background: 0.05 to
+0.1 behind a thing of 30 % of the image with most of the texture, below 0.01 where the camera moves."""
 _MIN_TWO_MOTIONS_SHARE = 0.93
 """Share of the inlier matches from which a rotation and a homography together explain all: 0.97 to 1.0 where
 a flat thing moves before a stationary camera; 0.6 to 0.85 in streets, 0.7 to 0.92 in rooms."""
@@ -160,8 +163,8 @@ def start_from_two_views(
             f"the camera has turned by {rotation_angle_deg(rotation):.0f} of at most {_MAX_TURN_DEG:g} deg"
         )
     else:
-        plane_share, two_motions_share = _explain_by_motions(first[rows], second[rows], camera)
-        is_plane, is_narrow = plane_share >= _MIN_PLANE_SHARE, median_deg < min_parallax_deg
+        is_plane, two_motions_share = _explain_by_motions(first[rows], second[rows], camera)
+        is_narrow = median_deg < min_parallax_deg
         if is_plane:
             reason = _describe_standstill(first, second, camera, _MAX_PLANE_ROTATION_SHARE)
         elif is_narrow:
@@ -254,15 +257,18 @@ def _describe_standstill(
     return ""
 
 
-def _explain_by_motions(first: Array, second: Array, camera: Camera) -> tuple[float, float]:
-    """Return which share of the matches one plane explains, and which a plane and a rotation together do.
+def _explain_by_motions(first: Array, second: Array, camera: Camera) -> tuple[bool, float]:
+    """Return whether the scene is one plane, and which share a plane and a rotation together explain.
 
-    The plane of the second share is that of the most matches, or that of the most others: a thing that moves
-    before a stationary camera may have more or fewer matches than what does not move.
+    Where matches that are not on the plane did not move, the scene is no plane: they are the background of a
+    thing that moves.  The plane of the second share is that of the most matches, or that of the most others:
+    a thing that moves may have more or fewer matches than its background.
     """
     on_plane = _is_on_plane(first, second)
     on_second_plane = np.zeros(len(first), dtype=np.bool_)
     on_second_plane[~on_plane] = _is_on_plane(first[~on_plane], second[~on_plane])
+    is_unmoved = np.linalg.norm(second - first, axis=1) <= _EXPLAINED_PX
+    is_plane = on_plane.mean() >= _MIN_PLANE_SHARE and (is_unmoved & ~on_plane).mean() < _MIN_STILL_SHARE
     shares = []
     for is_explained in (on_plane.copy(), on_second_plane):
         rest = ~is_explained
@@ -270,7 +276,7 @@ def _explain_by_motions(first: Array, second: Array, camera: Camera) -> tuple[fl
             rotation = fit_rotation(first[rest], second[rest], camera, inlier_px=_EXPLAINED_PX)
             is_explained[rest] = rotation.errors_px <= _EXPLAINED_PX
         shares.append(float(is_explained.mean()))
-    return float(on_plane.mean()), max(shares)
+    return bool(is_plane), max(shares)
 
 
 def _is_on_plane(first: Array, second: Array) -> npt.NDArray[np.bool_]:
