@@ -52,13 +52,14 @@ accepted; photos with a right camera and a rolling shutter stay below 5.1 degree
 _MAX_MAP_COORDINATE_M = 1e6
 """Largest coordinate in metres of a candidate keyframe in the map.  A keyframe beyond it has a false pose,
 since no robot drives 1,000 km; it is ignored, so that it does not make the pose of the view ambiguous."""
-_MIN_CAMERA_WEIGHT = 0.25
+_MIN_CAMERA_WEIGHT = 0.4
 """Smallest factor of the covariance that unknown intrinsics add to that of a pose.  It is below 1 because
 most stated intrinsics are right: with 1, nearly all errors of photos with a right camera are within one
-standard deviation."""
+standard deviation.  It is above 0.25 because the fitted focal length may err by as much as the stated one, so
+that both agree."""
 _DOUBTED_FOCAL_DEVIATIONS = 3.0
 """Difference of fitted and stated focal length, in standard deviations, from which on that factor is 1."""
-_GUIDED_FLOOR_M = 0.005
+_GUIDED_FLOOR_M = 0.002
 """Standard deviation along each axis, in metres, of the error that all landmarks around a pose have in
 common; its square is added to the variance of a guided search."""
 _GUIDED_FLOOR_DEG = 0.3

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, pose_difference, transform
 from rse_pf.maps.format import Keyframe
 from rse_pf.services.mapping.localise import LocaliseOptions, locate
+from rse_pf.services.mapping.photo import location_of
 from rse_pf.services.mapping.place import MapIndex
 from rse_pf.slam.guided_search import GuidedPose, MapLandmarks, search_around
 from rse_pf.slam.relative_pose import View, landmarks_of_keyframe
@@ -93,3 +95,17 @@ def test_keyframes_with_few_matches_each_place_a_view_together() -> None:
     assert (found.verdict, found.reason) == ("ok", "")
     assert found.T_map_camera is not None
     assert pose_difference(found.T_map_camera, TRUTH)[0] < 0.02
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.95, 1.05, 1.1])
+def test_a_wrong_focal_length_is_within_three_sigmas_of_a_pose_that_is_ok(factor: float) -> None:
+    right = VIEW.camera
+    camera = msgspec.structs.replace(right, fx=factor * right.fx, fy=factor * right.fy)
+
+    found = locate(MapIndex(MAP), replace(VIEW, camera=camera))
+
+    assert found.T_map_camera is not None
+    sigma_m = location_of(found, "version").position_sigma_m
+    assert sigma_m is not None
+    moved_m = pose_difference(found.T_map_camera, TRUTH)[0]
+    assert found.verdict != "ok" or moved_m <= max(0.05, 3.0 * sigma_m)
