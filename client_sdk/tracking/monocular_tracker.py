@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from client_sdk.frontend import Features, Frame, PoseQuery, TrackedFrame, describe, make_features
 from client_sdk.monocular.bundle import adjust
-from client_sdk.monocular.two_view import TwoViewStart, share_in_third_view, start_from_two_views
 from client_sdk.plugins import Plugins
 from client_sdk.tracking.landmark_map import (
     MAX_KEYFRAMES,
@@ -50,10 +49,10 @@ from client_sdk.tracking.monocular_segment import (
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
+from client_sdk.tracking.waiting_frames import MIN_START_MATCHES, Start, WaitingFrames
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, scaled, transform
-from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.tracking import GuidedMatchLimits
 
 __all__ = ["MonocularOptions", "MonocularTracker"]
@@ -69,17 +68,6 @@ time of a frame."""
 _START_DEPTH = 2.0
 """Median depth of a segment's first landmarks in its arbitrary unit: large enough that the rounding of points
 to 0.0001 units in a pose query does not matter."""
-_MAX_WAITING_FRAMES = 30
-"""Largest number of frames that are kept as possible first views of a new segment; then the oldest is
-dropped: bounds memory."""
-_MIN_START_MATCHES = 100
-"""Fewest features of a frame, and fewest matches between two frames, with which a segment can begin."""
-_MANY_START_MATCHES = 200
-"""Number of matches with a waiting view from which newer ones are not tried: they have less parallax.  A
-street at 4.8 frames a second has 279 matches with the frame before and 129 with the one before that."""
-_MIN_THIRD_VIEW_SHARE = 0.7
-"""Smallest share of the points of a start with which a third view must agree: 0.8 to 1.0 where the camera
-moves, 0.6 to 0.7 where it nearly only turns and the points are wrong."""
 _WIDE_SEARCH_FACTOR = 2.5
 """Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
 _TRACKED_RATIO = 0.25
@@ -178,37 +166,19 @@ class _Attempt:
     keyframe: int | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Start:
-    """Two views that begin a segment.
-
-    Attributes:
-        views: Relative pose and points of the two views.
-        first: Number of the waiting frame that is the first view; the present frame is the second one.
-        rows: Features of the first view that match, to which the rows of *views* refer.
-        columns: Features of the second view that match them.
-    """
-
-    views: TwoViewStart
-    first: int
-    rows: Rows
-    columns: Rows
-
-
 class MonocularTracker:
     """Visual odometry of one camera without depth, with relocalisation and loop closure.
 
     Use it as `Tracker`: ``prepare(frame)``, then ``accept(query, T_camera_world, inliers)`` until a
     `TrackedFrame` comes back.
 
-    A segment begins with two views that have parallax; when the second view comes, the frames between the two
-    views also get poses.  A frame
-    is matched near the pixels at which a constant velocity predicts the landmarks around the reference
-    keyframe, then in a wider radius, then with the last frame, then with the newest keyframes and with the
-    most similar keyframes of all segments.  If no pose fits, the frame is lost, and waits for the start of a
-    new segment.  Two segments are joined when two measurements in a row agree where one lies in the other;
-    the newer segment is moved into the older one, whose unit it takes.  An older place of the same segment
-    that is recognised twice closes a loop and corrects what drifted in between.
+    A segment begins with two views that have parallax; when the second view comes, the frames that waited
+    before it also get poses.  A frame is matched near the pixels at which a constant velocity predicts the
+    landmarks around the reference keyframe, then in a wider radius, then with the last frame, then with the
+    newest keyframes and with the most similar keyframes of all segments.  If no pose fits, the frame is lost,
+    and waits for the start of a new segment.  Two segments are joined when two measurements in a row agree
+    where one lies in the other; the newer segment is moved into the older one, whose unit it takes.  An older
+    place of the same segment that is recognised twice closes a loop and corrects what drifted in between.
 
     Attributes:
         options: Options of tracking.
@@ -239,8 +209,7 @@ class MonocularTracker:
         self._state = _TrackState()
         self._segments: dict[int, MonocularSegment] = {}
         self._next_segment = 0
-        self._waiting: list[tuple[float, MonocularView]] = []
-        """Times and images of frames without a pose that may be the first view of a segment."""
+        self._waiting = WaitingFrames(self.options.start_parallax_deg)
         self._frame: Frame  # the frame that is tracked, set by `prepare`
         self._raw: Features  # its features
         self._open = OpenQuery()
@@ -411,7 +380,7 @@ class MonocularTracker:
         if posed is None:
             return self._start_or_lose(view, reason)
         # 3. Keep the frame in the map, and look for its place in other segments or earlier in this one.
-        self._waiting = []
+        self._waiting.clear()
         is_keyframe = self._keep(posed)
         if len(self._segments) > 1 and self.frames % JOIN_INTERVAL_FRAMES == 0:
             yield from self._find_join()
@@ -588,13 +557,13 @@ class MonocularTracker:
         A frame with fewer than 100 features is lost without waiting.  A segment after the first begins only
         if more than ``segment_after`` frames with 100 features or more came since the last pose.
         """
-        if len(view.features) >= _MIN_START_MATCHES:
+        if len(view.features) >= MIN_START_MATCHES:
             self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
-            start, start_reason = self._find_start(view)
+            start, start_reason = self._waiting.find_start(view, self._frame.camera)
             may_begin = not self._segments or self._state.unrecognised > self.options.segment_after
             if start is not None and may_begin:
                 return self._begin_segment(view, start)
-            self._waiting.append((self._frame.timestamp_s, view))
+            self._waiting.add(self._frame.timestamp_s, view)
             reason = reason if self._segments else start_reason
         elif not self._segments:
             reason = f"only {len(view.features)} features"
@@ -605,65 +574,11 @@ class MonocularTracker:
         self.starting_frames += 1
         return self._make_result_without_pose("starting", reason)
 
-    def _find_start(self, view: MonocularView) -> tuple[_Start | None, str]:
-        """Find a waiting view that begins a segment together with the present one.
-
-        The oldest waiting view is tried first, as its parallax is the largest.  Where it has few matches, as
-        after a fast drive forward, the view halfway between it and the present one is tried next, and so on.
-
-        Returns:
-            The start, or None and why there is none.
-        """
-        if len(self._waiting) == _MAX_WAITING_FRAMES:
-            self._waiting.pop(0)
-        number, reason = 0, "the first frame"
-        while number < len(self._waiting):
-            first = self._waiting[number][1]
-            rows, columns = match_all(first.features.descriptors, view.features.descriptors)
-            if len(rows) < _MIN_START_MATCHES:
-                reason = f"only {len(rows)} matches with the frames before"
-            else:
-                views = start_from_two_views(
-                    first.features.pixels[rows],
-                    view.features.pixels[columns],
-                    self._frame.camera,
-                    min_parallax_deg=self.options.start_parallax_deg,
-                )
-                reason = views.reason or self._refute(views, number, rows)
-                if not reason:
-                    return _Start(views=views, first=number, rows=rows, columns=columns), ""
-                if views.is_still or len(rows) >= _MANY_START_MATCHES:
-                    break
-            number += max(1, (len(self._waiting) - number) // 2)
-        return None, reason
-
-    def _refute(self, views: TwoViewStart, first: int, rows: Rows) -> str:
-        """Say why a third waiting view does not agree with a start; return an empty text if it does.
-
-        The third view is that halfway between the two, or the one before the first if there is none between.
-
-        Args:
-            views: Pose and points of the waiting view *first* and the present one.
-            first: Number of that waiting view.
-            rows: Its features that match, to which the rows of *views* refer.
-        """
-        between = (first + len(self._waiting)) // 2
-        number = between if between > first else first - 1
-        if number < 0:
-            return "a third view has not come yet"
-        third = self._waiting[number][1].features
-        descriptors = self._waiting[first][1].features.descriptors[rows]
-        shown, columns = match_all(descriptors, third.descriptors)
-        share = share_in_third_view(views, shown, third.pixels[columns], self._frame.camera)
-        if share < _MIN_THIRD_VIEW_SHARE:
-            return f"a third view agrees with {100 * share:.0f} % of the points only"
-        return ""
-
-    def _begin_segment(self, view: MonocularView, start: _Start) -> TrackedFrame:
+    def _begin_segment(self, view: MonocularView, start: Start) -> TrackedFrame:
         """Begin a segment with a waiting view and the present one."""
         # 1. Make a map of two keyframes in a unit in which the median depth is 2, and adjust it.
         views = start.views
-        first_s, first = self._waiting[start.first]
+        first_s, first = self._waiting.frame(start.first)
         unit = _START_DEPTH / float(np.median(views.points[:, 2]))
         adjuster = self._plugins.optimiser or adjust
         new_map = LandmarkMap(self._frame.camera, adjuster)
@@ -681,7 +596,13 @@ class MonocularTracker:
         segment.set_reference(1)
         segment.add_frame(first_s, np.eye(4), 0)
         second = new_map.keyframes[1]
-        T_before = self._pose_waiting_frames(segment, start.first, second.T_camera_world)
+        T_before = self._waiting.fit_poses(
+            segment,
+            start.first,
+            second.T_camera_world,
+            search_px=self.options.search_px,
+            min_inliers=self.options.min_inliers,
+        )
         if not is_first:
             self.lost_frames -= len(segment.frames)
         # 3. Keep the present frame as the last one, from which the next frame is tracked.
@@ -699,45 +620,6 @@ class MonocularTracker:
             T_next_last=np.eye(4) if T_before is None else second.T_camera_world @ inverse(T_before),
         )
         return self._make_result(posed, is_keyframe=True)
-
-    def _pose_waiting_frames(self, segment: MonocularSegment, first: int, T_second: Array) -> Array | None:
-        """Fit the poses of the frames before the second view of a start.
-
-        Frames after the first view are fitted from an interpolated guess, then those before it from a
-        constant velocity, until one has no pose.  No frame waits any more afterwards.
-
-        Args:
-            segment: The new segment, whose origin is the first view.
-            first: Number of the waiting frame that is the first view.
-            T_second: ``(4, 4)``, ``T_camera_world`` of the second view.
-
-        Returns:
-            ``T_camera_world`` of the frame just before the second view; None if that frame has no pose.
-        """
-        waiting, self._waiting = self._waiting, []
-        count = len(waiting)
-        pose, newest = np.eye(4), None if first < count - 1 else np.eye(4)
-        step = -T_second[:3, 3] / (count - first)
-        for number in range(first + 1, count):
-            timestamp_s, view = waiting[number]
-            guess = pose.copy()
-            guess[:3, 3] += (T_second[:3, 3] - pose[:3, 3]) / (count - number + 1)
-            posed = segment.fit(view, guess, self.options.search_px, self.options.min_inliers)
-            newest = None
-            if posed is not None:
-                newest = pose = posed.T_camera_world
-                segment.add_frame(timestamp_s, pose, 0)
-        pose = np.eye(4)
-        for timestamp_s, view in reversed(waiting[:first]):
-            guess = pose.copy()
-            guess[:3, 3] += step
-            posed = segment.fit(view, guess, self.options.search_px, self.options.min_inliers)
-            if posed is None:
-                break
-            step = posed.T_camera_world[:3, 3] - pose[:3, 3]
-            pose = posed.T_camera_world
-            segment.add_frame(timestamp_s, pose, 0)
-        return newest
 
     # --- Keep ---
 
