@@ -5,6 +5,7 @@ Two views do not determine the length of the translation; here it is 1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,10 @@ _WIDE_PARALLAX_DEG = 1.0
 """Smallest parallax, in degrees, of the points at the sides: noise of stationary cameras stays below 0.3."""
 _EXPLAINED_PX = 3.0
 """Largest error, in pixels, of a match that a rotation or a homography explains: three times the noise of a
-feature."""
+feature.  In small images it is less, see `_EXPLAINED_DEG`."""
+_EXPLAINED_DEG = 0.38
+"""The same error as an angle, in degrees, which is the smaller limit below a focal length of 452 px: in an
+image of 320 px, 3 px explain a wall that the camera passes sideways as a rotation."""
 _MAX_ROTATION_SHARE = 0.6
 """Largest share of all matches that one rotation may explain: 0.8 to 1.0 where the camera only turns, also
 with focal lengths that are wrong by 7 %; 0.1 to 0.4 in drives forward over one or two frames, and up to 0.6
@@ -236,19 +240,25 @@ def _no_start(reason: str, *, is_still: bool = False) -> TwoViewStart:
     )
 
 
+def _explained_px(camera: Camera) -> float:
+    """Return the largest error, in pixels, of a match that a motion explains."""
+    return min(_EXPLAINED_PX, math.radians(_EXPLAINED_DEG) * min(camera.fx, camera.fy))
+
+
 def _describe_standstill(
     first: Array, second: Array, camera: Camera, max_rotation_share: float = _MAX_ROTATION_SHARE
 ) -> str:
     """Say that the camera did not move, or only turned; return an empty text if it moved."""
+    explained_px = _explained_px(camera)
     moved_px = np.linalg.norm(second - first, axis=1)
-    unmoved_share = float((moved_px <= _EXPLAINED_PX).mean())
+    unmoved_share = float((moved_px <= explained_px).mean())
     if unmoved_share > max_rotation_share:
         return (
             f"the camera does not move: {100 * unmoved_share:.0f} % of {len(first)} matches moved by less "
-            f"than {_EXPLAINED_PX:g} px"
+            f"than {explained_px:.2g} px"
         )
-    fit = fit_rotation(first, second, camera, inlier_px=_EXPLAINED_PX)
-    turned_share = float((fit.errors_px <= _EXPLAINED_PX).mean())
+    fit = fit_rotation(first, second, camera, inlier_px=explained_px)
+    turned_share = float((fit.errors_px <= explained_px).mean())
     if turned_share > max_rotation_share:
         return (
             f"the camera only turns: a rotation of {rotation_angle_deg(fit.R_second_first):.1f} deg explains "
@@ -264,29 +274,30 @@ def _explain_by_motions(first: Array, second: Array, camera: Camera) -> tuple[bo
     thing that moves.  The plane of the second share is that of the most matches, or that of the most others:
     a thing that moves may have more or fewer matches than its background.
     """
-    on_plane = _is_on_plane(first, second)
+    explained_px = _explained_px(camera)
+    on_plane = _is_on_plane(first, second, explained_px)
     on_second_plane = np.zeros(len(first), dtype=np.bool_)
-    on_second_plane[~on_plane] = _is_on_plane(first[~on_plane], second[~on_plane])
-    is_unmoved = np.linalg.norm(second - first, axis=1) <= _EXPLAINED_PX
+    on_second_plane[~on_plane] = _is_on_plane(first[~on_plane], second[~on_plane], explained_px)
+    is_unmoved = np.linalg.norm(second - first, axis=1) <= explained_px
     is_plane = on_plane.mean() >= _MIN_PLANE_SHARE and (is_unmoved & ~on_plane).mean() < _MIN_STILL_SHARE
     shares = []
     for is_explained in (on_plane.copy(), on_second_plane):
         rest = ~is_explained
         if rest.sum() >= _MIN_MOTION_MATCHES:
-            rotation = fit_rotation(first[rest], second[rest], camera, inlier_px=_EXPLAINED_PX)
-            is_explained[rest] = rotation.errors_px <= _EXPLAINED_PX
+            rotation = fit_rotation(first[rest], second[rest], camera, inlier_px=explained_px)
+            is_explained[rest] = rotation.errors_px <= explained_px
         shares.append(float(is_explained.mean()))
     return bool(is_plane), max(shares)
 
 
-def _is_on_plane(first: Array, second: Array) -> npt.NDArray[np.bool_]:
+def _is_on_plane(first: Array, second: Array, explained_px: float) -> npt.NDArray[np.bool_]:
     """Return which matches the homography explains that explains the most of them."""
     homography = None
     if len(first) >= _MIN_MOTION_MATCHES:
-        homography, _ = load_opencv().findHomography(first, second, load_opencv().RANSAC, _EXPLAINED_PX)
+        homography, _ = load_opencv().findHomography(first, second, load_opencv().RANSAC, explained_px)
     if homography is None:
         return np.zeros(len(first), dtype=np.bool_)
     moved = np.column_stack([first, np.ones(len(first))]) @ homography.T
     errors_px = np.linalg.norm(moved[:, :2] / moved[:, 2:] - second, axis=1)
-    is_on_plane: npt.NDArray[np.bool_] = errors_px <= _EXPLAINED_PX
+    is_on_plane: npt.NDArray[np.bool_] = errors_px <= explained_px
     return is_on_plane

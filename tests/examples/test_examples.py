@@ -61,15 +61,15 @@ def test_a_wrong_file_is_told_without_a_traceback(platform: ExamplePlatform) -> 
 
 @pytest.mark.slow
 def test_a_video_becomes_a_map(platform: ExamplePlatform) -> None:
-    write_video(platform.folder / "drive.mp4", frames=12)
+    write_video(platform.folder / "drive.mp4", frames=20)
 
     done = platform.run(platform.command("live_camera"))
 
     assert (done.returncode, done.stderr) == (0, "")
-    assert "12 frames, 0 lost; scale: up to scale" in done.stdout
+    assert "20 frames, 0 lost; scale: up to scale" in done.stdout
     assert len(read_ply(platform.folder / "out-camera" / "map.ply")[0]) > 100
     along = read_trajectory(platform.folder / "out-camera" / "trajectory.txt").positions
-    steps = np.arange(12)[:, None] / 11 * along[-1]
+    steps = np.arange(20)[:, None] / 19 * along[-1]
     assert np.linalg.norm(along - steps, axis=1).max() < 0.1 * np.linalg.norm(along[-1])
 
 

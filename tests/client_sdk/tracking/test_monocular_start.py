@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame
 from client_sdk.mapper import Mapper
 from client_sdk.simulator.renderer import Renderer, add_image_noise
@@ -26,6 +29,7 @@ CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 ALONG_ROOMS = np.array([[0, 0, 1, 1.0], [-1, 0, 0, 2.3], [0, -1, 0, 1.3], [0, 0, 0, 1]], dtype=float)
 """Pose in the first room that looks through the doors of all rooms, along x."""
 RATE_HZ = 10
+RECORDED = Path(__file__).parents[4] / "shared" / "data"
 
 
 def images(poses: list[Array], seed: int = 1) -> Iterator[np.ndarray]:
@@ -44,6 +48,25 @@ def frames(shown: Iterator[np.ndarray]) -> Iterator[Frame]:
 def moved(twist: list[float], count: int) -> list[Array]:
     """Return poses that add the same *twist* in the frame of the camera, count by count."""
     return [ALONG_ROOMS @ exp_se3(number * np.array(twist)) for number in range(count)]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("step", [1, 2, -1])
+def test_a_car_is_posed_from_its_first_image_also_backwards_and_at_half_rate(step: int) -> None:
+    folder = RECORDED / "kitti_06_start"
+    if not folder.exists():
+        pytest.skip("no recordings at ../shared/data")
+    recorded = list(islice(open_dataset(folder, camera="left"), 24))[::step]
+    tracker = MonocularTracker()
+
+    done = run_all(
+        tracker,
+        (replace(each, timestamp_s=number / RATE_HZ) for number, each in enumerate(recorded)),
+    )
+
+    first = next(number for number, each in enumerate(done, start=1) if each.status == "tracked")
+    assert first <= 8
+    assert len(tracker.trajectory()) == len(recorded)
 
 
 @pytest.mark.parametrize("step_m", [0.08, 0.16, -0.08])
