@@ -118,6 +118,11 @@ such a close, and does not report that another program uses its token."""
 TOKEN_CLOCK_STEP_S = 1.0
 """After a revocation the robot waits this many seconds before it signs a new token: a token states its time
 in whole seconds, which must be later than the revocation."""
+CLOCK_POLL_S = 1.0
+"""Seconds between two comparisons of the wall clock with the monotonic clock while a robot waits to dial."""
+CLOCK_STEP_S = 0.5
+"""A wall clock that moved by more than this many seconds against the monotonic clock was set by somebody;
+the robot then dials at once, because a server may have refused a token that was signed by the wrong time."""
 
 
 class Connection:
@@ -405,20 +410,32 @@ class Connection:
         """Dial *region*, with a pause before each attempt, until a server sends Welcome."""
         if self._clock() - region.connected_since_s > self._timings.reconnect_max_s:
             region.backoff.reset()
-        began_s = self._clock()
+        began_s, clock_offset_s = self._clock(), self._clock_offset_s()
         while True:
-            # 1. Pause for as long as the last failure demands.
+            # 1. Pause for as long as the last failure demands, or until the wall clock is set.
             now_s = self._clock()
             pause_s = region.backoff.pause_s(now_s, region.last_failure, spent_s=now_s - began_s)
-            await asyncio.sleep(pause_s)
+            await self._sleep_until_clock_step(pause_s, clock_offset_s)
             # 2. Dial the region, and wait for the Welcome.
-            began_s = self._clock()
+            began_s, clock_offset_s = self._clock(), self._clock_offset_s()
             region.last_failure = await self._join_region(region)
             # 3. Continue the commands on the new socket, or end them if every region refuses the robot.
             if region.last_failure is None:
                 self._adopt_if_disconnected(region)
                 return
             self._fail_refused_commands()
+
+    def _clock_offset_s(self) -> float:
+        """Return wall clock minus monotonic clock in seconds; it changes only if the wall clock is set."""
+        return self._wall_clock() - asyncio.get_running_loop().time()
+
+    async def _sleep_until_clock_step(self, pause_s: float, clock_offset_s: float) -> None:
+        """Wait for *pause_s* seconds at most; end if the wall clock was set since it had *clock_offset_s*."""
+        until_s = asyncio.get_running_loop().time() + pause_s
+        while (left_s := until_s - asyncio.get_running_loop().time()) > 0:
+            if abs(self._clock_offset_s() - clock_offset_s) > CLOCK_STEP_S:
+                return
+            await asyncio.sleep(min(left_s, CLOCK_POLL_S))
 
     def _fail_refused_commands(self) -> None:
         """End all commands with the reason if every region refuses this robot; dialling goes on."""

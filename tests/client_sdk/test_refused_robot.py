@@ -5,10 +5,11 @@ from __future__ import annotations
 import random
 import socket
 import time
+from dataclasses import replace
 
 import pytest
 from fake_platform import FakePlatform
-from quick_robots import answered, ask, robot
+from quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 import client_sdk
 from rse_pf.config import SessionSettings
@@ -57,6 +58,34 @@ async def test_a_refusal_that_names_the_time_of_the_cut_off_is_followed_by_a_lat
 
             assert (await answered(a_robot)).reply == {"value": 3}
             assert len(platform.tokens_seen) == 4  # a cut-off is no reason to ask for another token at once
+
+
+@pytest.mark.parametrize("when", ["after the refusal", "while the refusal is reported"])
+async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
+    now_s = [1000.0]
+    timings = replace(TIMINGS, reconnect_long_max_s=1000.0)
+
+    async def token():
+        return "t"
+
+    def set_clock(event, detail):
+        if event == "refused" and when == "while the refusal is reported":
+            now_s[0] -= 120.0
+
+    async with FakePlatform() as platform:
+        connecting = client_sdk.connect(
+            platform.url, token=token, settings=QUICK, timings=timings, random=random.Random(1),
+            on_change=set_clock, wall_clock=lambda: now_s[0] + time.monotonic(),
+        )  # fmt: skip
+        async with connecting as a_robot:
+            platform.refusal_members = {"cause": "not-yet-valid"}
+            platform.refusals = [(401, None)]
+            platform.sockets[0].cut()
+            await platform.until(lambda: not platform.refusals)
+            if when == "after the refusal":
+                now_s[0] -= 120.0
+
+            assert (await answered(a_robot)).reply == {"value": 3}
 
 
 async def test_subscriptions_outlive_a_refusal():
