@@ -52,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "calibrate",
         parents=[board],
         help="write the intrinsics of a camera, by a board or, without --board and --square-mm, by motion",
+        description="Without --board, --square-mm and --stereo, the motion in SOURCE calibrates the camera.",
     )
     calibrate.add_argument(
         "sources",
