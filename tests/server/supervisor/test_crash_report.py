@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import os
 import signal
 import threading
@@ -22,6 +23,8 @@ def crash_after(act: Callable[[CrashReport], object]) -> Crash:
     pid = os.fork()
     if pid == 0:
         try:
+            faulthandler.disable()  # a library of another test may have set handlers above it
+            signal.signal(signal.SIGSEGV, signal.SIG_DFL)
             report.begin()
             act(report)
         finally:
