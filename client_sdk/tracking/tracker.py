@@ -692,8 +692,8 @@ class Tracker:
         """Lose a frame without a pose; or begin a segment with it, if enough frames before it were lost.
 
         The first segment begins at the start pose, with a frame of at least ``min_inliers`` features with
-        depth.  A later one begins at the last accepted pose, with a frame of at least three times as many,
-        after more than ``segment_after`` frames with so many features, but without a pose, came since then.
+        depth.  A later one begins at the last accepted pose, with a frame of at least three times as many
+        features with depth, once more than ``segment_after`` such frames without a pose came since then.
         """
         feature_count = int(np.isfinite(view.features.points_camera[:, 2]).sum())
         factor = _BEGIN_DEPTHS_FACTOR if self._segments else 1

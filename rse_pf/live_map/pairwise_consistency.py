@@ -78,8 +78,8 @@ MAX_CONFIRMED_STEPS = 12.0
 confirm a single loop closure."""
 MAX_PATH_STEPS = 200.0
 """Steps of odometry of a path along which drift leaves no information on the relative pose.  A path that the
-search does not find counts as at most so many steps within one segment, where odometry connects both ends,
-and as at least so many steps elsewhere."""
+search does not find counts as this number of steps at most if both ends lie in one segment, where odometry
+connects them, and as this number of steps at least otherwise."""
 MAX_VISITED_KEYFRAMES = 250
 """Most keyframes that one search for shortest paths visits, to bound CPU time; the length of a path that is
 not found within them is estimated."""

@@ -52,9 +52,9 @@ RejectionCounts = Counter[tuple[int, int, str]]
 reason."""
 
 MAX_PAIRS = 700_000
-"""Largest product of the number of keyframes, the number of maps and `MergeOptions.candidates`.  A merge
-compares at most so many pairs of keyframes, each for some milliseconds; a merge with a larger product is
-refused."""
+"""Largest product of the number of keyframes, the number of maps and `MergeOptions.candidates`.  It bounds
+the number of pairs of keyframes that a merge compares, each for some milliseconds; a merge with a larger
+product is refused."""
 WEAK_POSE_VARIANCE = 4.0
 """Factor by which the covariance of a relative pose that PnP calls weak is multiplied; standard deviations
 become twice as large.  In rendered worlds the errors of such poses were typically 1.2 to 1.7 times, and at

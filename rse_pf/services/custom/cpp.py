@@ -36,8 +36,8 @@ _ABI = 1  # RSE_PF_SERVICE_ABI, the version of the C interface
 _FLOAT64 = 1  # RSE_PF_FLOAT64, the type of a field that holds an array of doubles
 _TEXT = 2  # RSE_PF_TEXT, the type of a field that holds UTF-8
 _MAX_RANK = 4  # most axes of an array, the size of ``shape`` in the C struct
-# Most fields of a reply: a larger count is a defect of the library, which becomes InternalError, since to
-# read so many fields could access memory that the library did not allocate.
+# Most fields of a reply.  A larger count is a defect of the library and becomes InternalError: reading its
+# fields could access memory that the library did not allocate.
 _MAX_FIELDS = 1024
 _MAX_BYTES = 1 << 28  # largest reply, snapshot or field in bytes: a larger one becomes InternalError
 _ERRORS: dict[int, type[RsePfError]] = {1: BadRequest, 2: CommandFailed, 3: DegenerateGeometry}

@@ -61,8 +61,8 @@ MAX_VIEW_FEATURES = 20_000
 request with more is refused with LimitExceeded."""
 _MAX_COMPARISONS = 2_000_000_000
 """Most comparisons of two ORB descriptors, one of the view and one of a candidate keyframe, in one request,
-which is refused with LimitExceeded beyond it; so many take about five seconds.  A comparison of longer
-descriptors counts as several, in proportion to their size."""
+which is refused with LimitExceeded beyond it; this number of comparisons takes about five seconds.
+A comparison of longer descriptors counts as several, in proportion to their size."""
 
 
 class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):

@@ -69,6 +69,18 @@ def test_a_car_is_posed_from_its_first_image_also_backwards_and_at_half_rate(ste
     assert len(tracker.trajectory()) == len(recorded)
 
 
+@pytest.mark.data
+def test_a_lens_that_nearly_only_turns_waits_until_a_third_view_agrees() -> None:
+    folder = RECORDED / "tum_fr1_rpy_start"
+    if not folder.exists():
+        pytest.skip("no recordings at ../shared/data")
+    turning = islice(open_dataset(folder), 20)
+
+    done = run_all(MonocularTracker(), (replace(each, depth_m=0 * each.depth_m) for each in turning))
+
+    assert {each.status for each in done} == {"starting"}
+
+
 @pytest.mark.parametrize("step_m", [0.08, 0.16, -0.08])
 def test_a_lens_that_drives_forward_or_backwards_is_posed_from_its_first_frame(step_m: float) -> None:
     poses = moved([0.0, 0.0, step_m, 0.0, 0.004, 0.0], 14)
