@@ -59,7 +59,7 @@ from rse_pf.pnp import DepthNoise, PnpOptions
 from rse_pf.slam.inertial import KeyframeImu, upright_rotation
 
 if TYPE_CHECKING:  # importing the recorder costs memory, which only robots that record should pay
-    from rse_pf.recording.robot_recorder import RobotRecorder
+    from rse_pf.extensions.recording.robot_recorder import RobotRecorder
 
 __all__ = ["AskPose", "Mapper", "ask_robot"]
 

@@ -52,9 +52,9 @@ if TYPE_CHECKING:
     from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction
     from client_sdk.point_map import MapOptions
     from client_sdk.tracking.monocular_tracker import MonocularOptions
+    from rse_pf.extensions.recording.robot_recorder import RobotRecorder
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
-    from rse_pf.recording.robot_recorder import RobotRecorder
 
 __all__ = ["MAX_DEADLINE_S", "OnProgress", "Robot", "connect"]
 
@@ -620,7 +620,9 @@ class Robot:
 
 
 def _make_recorder(folder: str | Path, thumbnails: bool, settings: SessionSettings) -> RobotRecorder:
-    from rse_pf.recording.robot_recorder import RobotRecorder  # robots that do not record need no mcap
+    from rse_pf.extensions.recording.robot_recorder import (
+        RobotRecorder,  # robots that do not record need no mcap
+    )
 
     return RobotRecorder(folder, thumbnails=thumbnails, session=settings, version=_sdk_version())
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import UsageError
-from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, body_poses, exp_se3, from_quaternion, inverse, log_se3, to_quaternion
+from rse_pf.storage.files import read_regular_file
 
 __all__ = ["Trajectory", "read_trajectory", "write_trajectory"]
 

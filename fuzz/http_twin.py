@@ -1,4 +1,4 @@
-"""Mutated HTTP requests: what `rse_pf.http_connections` accepts, `h11` understands in the same way.
+"""Mutated HTTP requests: what `rse_pf.http.connections` accepts, `h11` understands in the same way.
 
     python -m fuzz.http_twin [--count 100000] [--seed 1]
 
@@ -21,7 +21,7 @@ import h11
 import uvicorn
 from uvicorn.server import ServerState
 
-from rse_pf.http_connections import bounded_protocol
+from rse_pf.http.connections import bounded_protocol
 
 __all__ = ["Request", "compare", "disagreement"]
 

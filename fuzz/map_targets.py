@@ -18,8 +18,8 @@ from fuzz.meter import Meter
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError
 from rse_pf.geometry import Camera
-from rse_pf.ipc import FrameReader
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
+from rse_pf.processes.ipc import FrameReader
 from rse_pf.server.sandbox.policy import SandboxReply
 from rse_pf.server.sandbox.replies import outcome_of
 from rse_pf.service import dispatch

@@ -16,9 +16,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from rse_pf.ipc import encode_message
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
+from rse_pf.processes.ipc import encode_message
 from rse_pf.services.pnp import make_request
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe
 from rse_pf.slam.pose_graph import write_g2o

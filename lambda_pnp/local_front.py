@@ -27,9 +27,9 @@ from lambda_pnp.keys import KeyCache
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.front_door import BEARER_PATTERN, BURST_PATH
 from rse_pf.errors import NotFound, RsePfError
-from rse_pf.http_connections import bounded_protocol
-from rse_pf.linux import die_with_parent, set_process_name
-from rse_pf.silent_connections import BACKLOG, MAX_SILENT
+from rse_pf.http.connections import bounded_protocol
+from rse_pf.http.unauthenticated import BACKLOG, MAX_SILENT
+from rse_pf.processes.linux import die_with_parent, set_process_name
 from rse_pf.terminal import show, show_error, show_json
 
 __all__ = ["LocalFront", "answering_of", "read_beside"]

@@ -24,8 +24,8 @@ import msgspec
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings
 from rse_pf.errors import UsageError
-from rse_pf.files import create_private_file, read_private_file
 from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.storage.files import create_private_file, read_private_file
 
 __all__ = ["Enrolment", "EnrolmentFile"]
 

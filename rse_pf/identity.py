@@ -6,13 +6,33 @@ robot.  A dictionary, a lock, a path or a lease that knows a robot by its name a
 
 from __future__ import annotations
 
+import hashlib
+import re
 from typing import NamedTuple
 
-from rse_pf.object_store import name_segment
-
-__all__ = ["DEFAULT_TENANT", "RobotId", "folders_of", "object_name", "shown_name", "state_name"]
+__all__ = [
+    "DEFAULT_TENANT",
+    "RobotId",
+    "folders_of",
+    "name_segment",
+    "object_name",
+    "shown_name",
+    "state_name",
+]
 
 DEFAULT_TENANT = "default"
+_PLAIN_SEGMENT = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+
+
+def name_segment(text: str) -> str:
+    """Return a segment of an object's name for any *text*; no two texts have the same.
+
+    A text that is not plain (a lower-case letter or digit, then at most 63 of these and hyphens) becomes
+    ``x=`` and its sha256 in hex.
+    """
+    if _PLAIN_SEGMENT.fullmatch(text):
+        return text
+    return "x=" + hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 class RobotId(NamedTuple):

@@ -44,7 +44,7 @@ END
 echo "LocalStack: answers on port $port; its log is $out/localstack.log"
 
 if [ $# -eq 0 ]; then
-  set -- tests/aws tests/test_object_store.py tests/cli tests/localstack
+  set -- tests/aws tests/storage/test_object_store.py tests/cli tests/localstack
 fi
 # One after the other: names of buckets are global.
 PATH="$PWD/.venv/bin:$PATH" LOCALSTACK_HOST="localhost:$port" .venv/bin/python -m pytest -q -rsfEx -n 0 -m "not slow" "$@"

@@ -1,7 +1,7 @@
 """Add what the package contains of others to bills of materials in CycloneDX: python scripts/sbom.py FILE ...
 
 The locks name what is installed beside the package.  The fleet page has JavaScript of others within:
-``rse_pf/fleet_page/static/vendor/vendored.json`` lists it, with versions, licences and digests.
+``rse_pf/extensions/fleet_page/static/vendor/vendored.json`` lists it, with versions, licences and digests.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rse_pf.fleet_page.static_files import vendored
+from rse_pf.extensions.fleet_page.static_files import vendored
 
 __all__ = ["main", "with_vendored"]
 
-_FOLDER = "rse_pf/fleet_page/static/vendor"
+_FOLDER = "rse_pf/extensions/fleet_page/static/vendor"
 
 
 def with_vendored(bill: Mapping[str, Any], packages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

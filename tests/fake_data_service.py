@@ -15,7 +15,7 @@ from rse_pf.data_server import DataServer
 from rse_pf.data_server.robot_processes import max_map_bytes
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary, describe_map
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 
 NOW = 1_700_000_000.0
 KEY = SigningKey.from_seed(b"k" * 32, "key-1")

@@ -20,7 +20,7 @@ from typing import Any
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.config import PlatformSettings
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.wire import SUBPROTOCOLS
 
 __all__ = ["KEY", "GuardedServer"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import uvicorn
 
-from rse_pf.http_connections import bounded_protocol
+from rse_pf.http.connections import bounded_protocol
 
 
 @contextlib.asynccontextmanager

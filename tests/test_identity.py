@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rse_pf.auth.roster import EnrolledRobot
 from rse_pf.identity import RobotId, folders_of, object_name, shown_name, state_name
-from rse_pf.object_store import is_name
+from rse_pf.storage.object_store import is_name
 
 THUMBPRINT = "kPrK_qmxVWaYVA9wwBF6Iuo3vVzz7TxHCTwXBygrS4k"
 words = st.text(min_size=1, max_size=64)

@@ -28,15 +28,15 @@ import numpy as np
 
 from benchmarks.frame.registry import Bar, Recordings, benchmark, command_of
 from benchmarks.frame.report import say
-from rse_pf.batch.cluster import DaskEngine, LocalCluster
-from rse_pf.batch.merge import BatchMerge, BatchMergeResult
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.batch.cluster import DaskEngine, LocalCluster
+from rse_pf.extensions.batch.merge import BatchMerge, BatchMergeResult
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, decode_map, encode_map
-from rse_pf.object_store import DirectoryStore, digest_of
-from rse_pf.one_thread import ONE_THREAD
+from rse_pf.processes.one_thread import ONE_THREAD
 from rse_pf.slam.cloud_deform import deform_cloud
 from rse_pf.slam.loop_closures import Atlas, MergeOptions, measure_pairs
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 from tests.batch.in_process import InProcessEngine
 
 __all__ = ["kitchen", "noisy_copy"]

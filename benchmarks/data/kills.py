@@ -32,7 +32,7 @@ from benchmarks.frame.registry import Bar, benchmark
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.routes import openapi_page
 from rse_pf.data_server.server import KeysFile, serve_data
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 CALLS = (
     "open", "write", "pwrite", "fsync", "replace", "rename", "mkdir", "close", "unlink", "rmdir", "ftruncate",

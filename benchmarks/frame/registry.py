@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from benchmarks.frame.report import Bar, judge, show, write
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.experiments.results.result_folder import environment, load_average
+from rse_pf.extensions.experiments.results.result_folder import environment, load_average
 
 __all__ = ["Bar", "Benchmark", "Recordings", "benchmark", "command_of", "find", "names", "parser_of", "run"]
 

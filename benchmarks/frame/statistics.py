@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rse_pf.experiments.results.summary import percentiles
+from rse_pf.extensions.experiments.results.summary import percentiles
 
 __all__ = ["interleaved", "median_ratio", "percentile", "spread"]
 

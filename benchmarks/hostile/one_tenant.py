@@ -48,17 +48,17 @@ from benchmarks.frame.statistics import median_ratio, percentile
 from benchmarks.server.serving import resident_mib
 from client_sdk import connect
 from client_sdk.robot import Robot
-from rse_pf.accounts import stored_by_tenant
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.firewall import ensure_key
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
+from rse_pf.storage.object_store import DirectoryStore, digest_of
+from rse_pf.storage.quotas import stored_by_tenant
 from rse_pf.wire.live_map import live_topic
 
 __all__ = ["ATTACKS", "measure"]

@@ -25,8 +25,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-import rse_pf.experiments.demo.robot as demo_robot
-import rse_pf.experiments.demo.run as demo_run
+import rse_pf.extensions.experiments.demo.robot as demo_robot
+import rse_pf.extensions.experiments.demo.run as demo_run
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import percentile
 from client_sdk import frontend, point_map
@@ -35,8 +35,8 @@ from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajector
 from client_sdk.tracking import tracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.demo.run import DemoOptions, RobotSpec, run_demo
-from rse_pf.experiments.results.records import read_commands
+from rse_pf.extensions.experiments.demo.run import DemoOptions, RobotSpec, run_demo
+from rse_pf.extensions.experiments.results.records import read_commands
 
 SEED = 0
 RATE_HZ = 5.0

@@ -25,7 +25,7 @@ from benchmarks.frame.statistics import percentile, spread
 from benchmarks.recorded_drives import Run, drive, frame_poses, red_kitchen, truth_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
-from rse_pf.experiments.results.trajectory_error import ate_m
+from rse_pf.extensions.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured, MapStarted
 from rse_pf.live_map.live_map import LiveMap

@@ -40,7 +40,7 @@ from benchmarks.server.load import (
 )
 from benchmarks.server.serving import BenchServer, cpu_of_tree_s, private_bytes_of_tree
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.local.control.platform import LocalPlatform
 
 SETTINGS: dict[str, dict[str, Any]] = {

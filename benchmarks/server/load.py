@@ -26,8 +26,8 @@ import numpy.typing as npt
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.experiments.load.payloads import make_payloads
-from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.payloads import make_payloads
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, Message, Ping, make_codec
 from rse_pf.wire.preencoded import encode_command
 

@@ -45,7 +45,7 @@ from benchmarks.server.load import (
     run_load,
 )
 from rse_pf.errors import UsageError
-from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
 
 Frames = Literal["kept", "newest"]
 MULTIPLES = (1.0, 1.2, 1.5, 2.0, 3.0)

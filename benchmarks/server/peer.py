@@ -43,7 +43,7 @@ from benchmarks.server.load import (
 )
 from benchmarks.server.serving import UNLIMITED, BenchServer, cpu_of_tree_s
 from rse_pf.errors import ConfigurationError
-from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.pnp.problems import make_problem
 
 WORKERS = 2

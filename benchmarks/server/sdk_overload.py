@@ -55,9 +55,9 @@ from benchmarks.server.load import (
 from client_sdk import connect
 from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.load.payloads import make_payloads
-from rse_pf.experiments.load.scenario import LoadScenario
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.extensions.experiments.load.payloads import make_payloads
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.wire import (
     SUBPROTOCOLS,
     Command,

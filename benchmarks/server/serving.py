@@ -20,7 +20,7 @@ from typing import Any
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.linux import raise_descriptor_limit
+from rse_pf.processes.linux import raise_descriptor_limit
 
 __all__ = ["UNLIMITED", "BenchServer", "cpu_of_tree_s", "private_bytes_of_tree", "resident_mib", "tree"]
 

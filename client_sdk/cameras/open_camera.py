@@ -32,8 +32,8 @@ from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration, read_intrinsics, read_rig
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
-from rse_pf.files import check_exists
 from rse_pf.geometry import Camera
+from rse_pf.storage.files import check_exists
 
 __all__ = ["is_recording", "open_camera", "source_of_frames"]
 

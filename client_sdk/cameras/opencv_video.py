@@ -16,8 +16,8 @@ from typing import Any
 from client_sdk.cameras.source import RawFrame
 from client_sdk.datasets.images import colour_of
 from rse_pf.errors import UsageError
-from rse_pf.files import check_exists
 from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
+from rse_pf.storage.files import check_exists
 
 __all__ = ["Video", "open_video"]
 

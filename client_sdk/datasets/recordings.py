@@ -41,8 +41,8 @@ from client_sdk.source_facts import (
 )
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
-from rse_pf.files import check_exists, read_regular_file
 from rse_pf.geometry import Camera, Lens
+from rse_pf.storage.files import check_exists, read_regular_file
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 

@@ -35,9 +35,9 @@ from rse_pf.errors import (
     Unauthorized,
     UsageError,
 )
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.slam.cloud_deform import voxel_keys
 from rse_pf.slam.keyframe_points import encode_points
-from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["Attachments", "BackgroundUploader", "EncodedAttachments", "StoreObject", "encode_keyframe_points"]
 

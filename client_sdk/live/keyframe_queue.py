@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rse_pf.errors import UsageError
-from rse_pf.files import TEMPORARY_PREFIX, replace_file
+from rse_pf.storage.files import TEMPORARY_PREFIX, replace_file
 
 __all__ = ["KeyframeQueue", "NumberOffset", "QueuedKeyframe", "choose_number_offset"]
 

@@ -33,7 +33,7 @@ from rse_pf.errors import (
     Unauthorized,
     UnknownService,
 )
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.wire.live_map import KeyframeKept, KeyframeRequest
 
 __all__ = [

@@ -19,7 +19,7 @@ from random import Random
 from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.network.dial_errors import DialError
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = ["Backoff"]
 

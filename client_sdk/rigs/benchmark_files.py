@@ -11,8 +11,8 @@ import numpy as np
 from client_sdk.rigs.intrinsics import Intrinsics, name_file_in_errors, parse_lens_model
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import UsageError
-from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera
+from rse_pf.storage.files import read_regular_file
 
 __all__ = [
     "read_euroc_camera",

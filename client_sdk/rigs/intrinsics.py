@@ -28,9 +28,9 @@ import numpy as np
 
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import InvalidCamera, UsageError
-from rse_pf.files import read_document
 from rse_pf.geometry import LENS_MODELS, Camera, Lens, find_lens_model
 from rse_pf.images import MAX_IMAGE_PIXELS
+from rse_pf.storage.files import read_document
 
 __all__ = [
     "INTRINSICS_HINT",

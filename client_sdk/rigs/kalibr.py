@@ -16,8 +16,8 @@ import numpy as np
 from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in_errors, parse_lens_model
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import MissingExtra, UsageError
-from rse_pf.files import read_document
 from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.storage.files import read_document
 
 __all__ = ["read_kalibr"]
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = [
     "REFUSALS_PER_S",

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from rse_pf.audit.entry import Entry, Value, entry_line, parse_entry
 from rse_pf.errors import ConfigurationError
-from rse_pf.files import OWNER_ONLY, sync_folder
+from rse_pf.storage.files import OWNER_ONLY, sync_folder
 
 __all__ = [
     "CONTROL_PLANE",

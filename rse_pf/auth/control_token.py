@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from rse_pf.errors import UsageError
-from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
+from rse_pf.storage.files import OWNER_ONLY, read_private_file, replace_file
 
 __all__ = ["bearer", "carries_token", "ensure_control_token", "read_control_token"]
 

@@ -16,7 +16,7 @@ from rse_pf.auth.roster import MAX_ROSTER_BYTES, DenyList, Roster, from_json, to
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config.resource_names import DENY_NAME, ROBOTS_NAME
 from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError, UsageError, message_of
-from rse_pf.object_store import DirectoryStore, ObjectStore
+from rse_pf.storage.object_store import DirectoryStore, ObjectStore
 
 __all__ = [
     "DENY_NAME",

@@ -26,7 +26,7 @@ from rse_pf.errors import NotFound, UsageError
 from rse_pf.identity import RobotId
 from rse_pf.local.state import state_folder
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
@@ -101,8 +101,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Merge in parts; the exit code is 1 if a map was not joined."""
-    from rse_pf.batch.cluster import Cluster, DaskEngine, LocalCluster, RemoteCluster
-    from rse_pf.batch.merge import BatchMerge
+    from rse_pf.extensions.batch.cluster import Cluster, DaskEngine, LocalCluster, RemoteCluster
+    from rse_pf.extensions.batch.merge import BatchMerge
     from rse_pf.services.mapping.merge import reply_of
     from rse_pf.slam.loop_closures import MergeOptions
 
@@ -155,7 +155,7 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _clean(store: ObjectStore) -> int:
-    from rse_pf.batch.parts import PREFIX
+    from rse_pf.extensions.batch.parts import PREFIX
 
     names = [info.name for info in store.list(f"{PREFIX}/")]
     for name in names:

@@ -25,7 +25,7 @@ from rse_pf.cli.extras import require
 from rse_pf.cli.sensors import add_accept_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.files import read_document, replace_file
+from rse_pf.storage.files import read_document, replace_file
 from rse_pf.terminal import show, show_json, show_progress
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def _watched(
     """
     from client_sdk.check.observer import DriveObserver
     from client_sdk.mapper import Mapper
-    from rse_pf.experiments.compare.solvers import InProcessSolver
+    from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 
     observer = DriveObserver(reference)
     observer.add_pairs(fault)

@@ -70,9 +70,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             )
     check_accepted(args.accept)
     require("compare")
-    from rse_pf.experiments.compare.configurations import configurations_of
-    from rse_pf.experiments.compare.recordings import drives_of
-    from rse_pf.experiments.compare.run import CompareOptions, run_compare
+    from rse_pf.extensions.experiments.compare.configurations import configurations_of
+    from rse_pf.extensions.experiments.compare.recordings import drives_of
+    from rse_pf.extensions.experiments.compare.run import CompareOptions, run_compare
 
     options = CompareOptions(
         configurations=configurations_of(args.configs),

@@ -22,7 +22,7 @@ from rse_pf.cli.extras import require
 from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.recording.writer import with_recordings
+from rse_pf.extensions.recording.writer import with_recordings
 from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
     load_features(args.features)
     settings = with_recordings(settings, args.record)
-    from rse_pf.experiments.demo.run import DemoOptions, run_demo
+    from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
 
     shown: tuple[str, ...] = ()
     if args.data is not None:

@@ -120,7 +120,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.paper.elasticity import ElasticityOptions, run_elasticity
+    from rse_pf.extensions.experiments.paper.elasticity import ElasticityOptions, run_elasticity
 
     if settings.scaling.period_s / args.speed < 0.5:
         raise UsageError(
@@ -131,7 +131,7 @@ def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _latency(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.paper.latency import LatencyOptions, run_latency
+    from rse_pf.extensions.experiments.paper.latency import LatencyOptions, run_latency
     from rse_pf.local.faults.network_emulator import profile_named
 
     link = None if args.link == "none" else profile_named(args.link).name
@@ -139,8 +139,8 @@ def _latency(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
-    from rse_pf.experiments.paper.robustness import RobustnessOptions, run_robustness
+    from rse_pf.extensions.experiments.paper.fault_scenarios import SCENARIOS
+    from rse_pf.extensions.experiments.paper.robustness import RobustnessOptions, run_robustness
 
     return run_robustness(_options(RobustnessOptions, args, only=_faults(args.only, SCENARIOS)), settings)
 
@@ -155,16 +155,16 @@ def _faults(only: str | None, known: Collection[str]) -> tuple[str, ...]:
 
 
 def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.demo.run import DemoOptions
-    from rse_pf.experiments.paper.mapping import run_map
+    from rse_pf.extensions.experiments.demo.run import DemoOptions
+    from rse_pf.extensions.experiments.paper.mapping import run_map
 
     return run_map(_options(DemoOptions, args, rate_hz=args.fps, quiet=True), settings)
 
 
 def _live(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.demo.run import DemoOptions
-    from rse_pf.experiments.paper.live_faults import LIVE_FAULTS, run_live_faults
-    from rse_pf.experiments.paper.live_map import run_live
+    from rse_pf.extensions.experiments.demo.run import DemoOptions
+    from rse_pf.extensions.experiments.paper.live_faults import LIVE_FAULTS, run_live_faults
+    from rse_pf.extensions.experiments.paper.live_map import run_live
 
     options = _options(DemoOptions, args, rate_hz=args.fps, live=True, quiet=True)
     only = _faults(args.only, LIVE_FAULTS)
@@ -179,7 +179,7 @@ def _options(kind: type[T], args: argparse.Namespace, **changed: Any) -> T:
 
 
 def _verify(folder: Path | None) -> int:
-    from rse_pf.experiments.paper.verify import verify
+    from rse_pf.extensions.experiments.paper.verify import verify
 
     if folder is None:
         raise UsageError("verify needs a folder", hint="rse-pf experiment verify DIR")
@@ -195,8 +195,8 @@ def _verify(folder: Path | None) -> int:
 
 def _rerun(folder: Path, settings: PlatformSettings) -> int:
     """Run the short form of each experiment in *folder*; return 1 if a figure was not reached."""
-    from rse_pf.experiments.paper.verify import read_report, report_folders
-    from rse_pf.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures
+    from rse_pf.extensions.experiments.paper.verify import read_report, report_folders
+    from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures
 
     missed = 0
     for part in report_folders(folder):

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from rse_pf.config import load_settings
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
-from rse_pf.one_thread import ONE_THREAD
+from rse_pf.processes.one_thread import ONE_THREAD
 from rse_pf.terminal import show, show_error, show_page
 
 __all__ = ["VERBS", "Parser", "main", "parser_of", "verb_module"]

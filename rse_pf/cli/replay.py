@@ -26,10 +26,10 @@ from rse_pf.errors import UsageError
 from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:
-    from rse_pf.recording.replay.limited import LimitedReplay
-    from rse_pf.recording.replay.report import Attempt, CommandReport
-    from rse_pf.recording.replay.run import Overview
-    from rse_pf.recording.replay.solving import Overrides
+    from rse_pf.extensions.recording.replay.limited import LimitedReplay
+    from rse_pf.extensions.recording.replay.report import Attempt, CommandReport
+    from rse_pf.extensions.recording.replay.run import Overview
+    from rse_pf.extensions.recording.replay.solving import Overrides
 
 __all__ = ["add_arguments", "run"]
 
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """List, solve again or show; return 1 if an answer that should be equal is not."""
     require("replay")
-    from rse_pf.recording.replay.limited import LimitedReplay
+    from rse_pf.extensions.recording.replay.limited import LimitedReplay
 
     overrides = _overrides(args)
     _check(args)
@@ -89,7 +89,7 @@ def _check(args: argparse.Namespace) -> None:
 def _overrides(args: argparse.Namespace) -> Overrides:
     """Return what is to be tried; raises UsageError for a number out of its range."""
     from rse_pf.errors import BadRequest
-    from rse_pf.recording.replay.solving import Overrides
+    from rse_pf.extensions.recording.replay.solving import Overrides
 
     if args.inlier_px is not None and not math.isfinite(args.inlier_px):
         raise UsageError(f"--inlier-px {args.inlier_px} is no number of pixels", hint="try 2, 4, 8 or 16")
@@ -240,7 +240,7 @@ def _report_json(report: CommandReport) -> dict[str, Any]:
 
 
 def _write_page(path: Path, reports: Any, overview: Overview | None, name: str) -> None:
-    from rse_pf.recording.replay.page import html_page
+    from rse_pf.extensions.recording.replay.page import html_page
 
     try:
         path.write_text(html_page(reports, overview=overview, title=f"Replay of {name}"), encoding="utf-8")

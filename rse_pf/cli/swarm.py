@@ -27,7 +27,7 @@ from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import UsageError
 
 if TYPE_CHECKING:
-    from rse_pf.experiments.load.run import TargetPlatform
+    from rse_pf.extensions.experiments.load.run import TargetPlatform
 
 __all__ = ["add_arguments", "run"]
 
@@ -68,9 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
-    from rse_pf.experiments.load.run import run_swarm
-    from rse_pf.experiments.load.scenario import LoadScenario, read_scenario
-    from rse_pf.recording.writer import with_recordings
+    from rse_pf.extensions.experiments.load.run import run_swarm
+    from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario
+    from rse_pf.extensions.recording.writer import with_recordings
 
     given = {
         "robots": args.robots, "fps": args.fps, "seconds": args.seconds, "codec": args.codec,
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _platform(args: argparse.Namespace, settings: PlatformSettings) -> TargetPlatform | None:
-    from rse_pf.experiments.load.run import TargetPlatform
+    from rse_pf.extensions.experiments.load.run import TargetPlatform
     from rse_pf.local.firewall import key_file, read_key
     from rse_pf.local.state import read_state, settings_file, state_folder
 

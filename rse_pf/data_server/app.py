@@ -50,7 +50,7 @@ from rse_pf.errors import (
 )
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["DataServer"]
 

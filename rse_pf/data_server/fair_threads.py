@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from rse_pf.errors import Disconnected
-from rse_pf.fair_queue import FairQueue
 from rse_pf.identity import RobotId
+from rse_pf.limits.fair_queue import FairQueue
 
 __all__ = ["FairThreads", "check_wanted", "while_wanted"]
 

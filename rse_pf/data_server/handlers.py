@@ -51,12 +51,12 @@ from rse_pf.data_server.routes import (
 from rse_pf.data_server.uploads import Objects
 from rse_pf.errors import BadRequest, Conflict, NotFound
 from rse_pf.identity import RobotId
-from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.photos import PhotoLens
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import choose_superseded, count_freed_bytes
-from rse_pf.object_store import DirectoryStore, ObjectStore, PresigningStore
+from rse_pf.storage.charges import charge_name
+from rse_pf.storage.object_store import DirectoryStore, ObjectStore, PresigningStore
 
 __all__ = ["Handler", "Handlers", "MapWork"]
 

@@ -9,11 +9,11 @@ import json
 
 import msgspec
 
-from rse_pf.child.limited import Handler
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary, describe_map
+from rse_pf.processes.limited import Handler
 
 __all__ = ["TARGET", "MapDescriber", "make_handler"]
 

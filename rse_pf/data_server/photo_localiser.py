@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from rse_pf.child.limited import Handler, limit_cpu
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.errors import MissingExtra
 from rse_pf.identity import RobotId
 from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
+from rse_pf.processes.limited import Handler, limit_cpu
 
 if TYPE_CHECKING:
     from rse_pf.maps.format import MapVersion

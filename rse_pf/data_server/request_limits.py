@@ -14,7 +14,7 @@ from rse_pf.config import DataSettings
 from rse_pf.data_server.http import HttpRequest, TooManyRequests
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = ["RequestLimits"]
 

@@ -9,12 +9,12 @@ import json
 from collections.abc import Callable
 
 from rse_pf.aws.storage import open_data_store
-from rse_pf.child.limited import LimitedProcesses, ProcessLimits
 from rse_pf.config import PlatformSettings
-from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Crashed
 from rse_pf.identity import RobotId
-from rse_pf.object_store import ObjectStore
+from rse_pf.limits.crash_record import CrashRecord
+from rse_pf.processes.limited import LimitedProcesses, ProcessLimits
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["RobotProcesses", "max_map_bytes", "shared_store"]
 

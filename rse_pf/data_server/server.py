@@ -25,11 +25,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
 from rse_pf.data_server.uploads import UPLOAD_TTL_S
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
-from rse_pf.event_loop import run_in_loop
-from rse_pf.files import replace_json
-from rse_pf.http_connections import bounded_protocol
-from rse_pf.object_store import DirectoryStore, ObjectStore
-from rse_pf.silent_connections import BACKLOG
+from rse_pf.http.connections import bounded_protocol
+from rse_pf.http.unauthenticated import BACKLOG
+from rse_pf.processes.event_loop import run_in_loop
+from rse_pf.storage.files import replace_json
+from rse_pf.storage.object_store import DirectoryStore, ObjectStore
 from rse_pf.terminal import json_line, show
 
 __all__ = ["KeysFile", "serve_data"]

@@ -15,14 +15,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 
-from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.fair_threads import check_wanted, while_wanted
 from rse_pf.data_server.routes import Upload
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
 from rse_pf.identity import object_name
-from rse_pf.object_store import DirectoryStore, ObjectInfo, ObjectStore, PresigningStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, ObjectInfo, ObjectStore, PresigningStore, digest_of
+from rse_pf.storage.quotas import Accounts
 
 __all__ = ["Objects"]
 

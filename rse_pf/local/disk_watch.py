@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore
-from rse_pf.disk_reserve import DiskReserve
 from rse_pf.errors import RsePfError
-from rse_pf.files import replace_file
-from rse_pf.object_store import DirectoryStore
 from rse_pf.scaling.operator_alarms import LOW_DISK_PERCENT
+from rse_pf.storage.disk_reserve import DiskReserve
+from rse_pf.storage.files import replace_file
+from rse_pf.storage.object_store import DirectoryStore
 
 __all__ = [
     "LOOK_S", "DiskSpace", "DiskWatch", "access_control_store", "disk_level", "disk_line", "disk_spaces",

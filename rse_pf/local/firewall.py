@@ -15,8 +15,8 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import is_loopback
 from rse_pf.config.resource_names import ROBOTS_PATH
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 from rse_pf.local.lan.listener import LanListener
+from rse_pf.storage.files import OWNER_ONLY, read_private_file, replace_file
 
 __all__ = [
     "check_lan_settings", "check_listener", "ensure_key", "key_file", "key_set_file", "read_key",

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError
-from rse_pf.files import TEMPORARY_PREFIX
-from rse_pf.linux import die_with_parent
+from rse_pf.processes.linux import die_with_parent
+from rse_pf.storage.files import TEMPORARY_PREFIX
 
 __all__ = [
     "STOP_TIMEOUT_S",

@@ -18,8 +18,8 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError, SettingsError, UsageError
-from rse_pf.files import replace_file
 from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, send_signal, wait_ended
+from rse_pf.storage.files import replace_file
 
 __all__ = [
     "PlatformLock",

@@ -21,9 +21,10 @@ from typing import BinaryIO, Literal
 import msgspec
 
 from rse_pf.errors import NotFound, UsageError
+from rse_pf.identity import name_segment
 from rse_pf.maps.record import MapRecord
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of, name_segment
+from rse_pf.storage.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of
 
 __all__ = ["BackupContent", "CheckedBackup", "check_backup", "restore_backup", "write_backup"]
 
@@ -34,8 +35,8 @@ _MEMBER = re.compile(r"(?P<map>[a-z0-9][a-z0-9-]{0,63})/(?P<kind>blobs|versions)
 _CHARGE = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}/(?P<map>[a-z0-9-]{1,64})/(?P<id>[0-9a-f]{64})\.\d{1,15}"
 )
-"""Name of a charge (see `rse_pf.maps.charges`) without ``charges/TENANT/``: robot, map, id of the version and
-size in bytes."""
+"""Name of a charge (see `rse_pf.storage.charges`) without ``charges/TENANT/``: robot, map, id of the version
+and size in bytes."""
 _MAX_RECORD_BYTES = 1 << 20
 """Largest size in bytes of the record of one version in a backup file: 1 MiB, though a record with many
 robots has some KiB only.  A file with a larger record is refused as malformed."""
@@ -56,7 +57,7 @@ class BackupContent(msgspec.Struct, frozen=True, kw_only=True):
         created_s: When the backup was written, Unix seconds.
         heads: The id of the head of each map, by the name of the map.
         charges: The charges of the versions: names of objects below ``charges/TENANT/``, see
-            `rse_pf.maps.charges`.
+            `rse_pf.storage.charges`.
     """
 
     format: Literal["rse-pf-maps"] = "rse-pf-maps"

@@ -1,7 +1,7 @@
 """Count what an encoded map contains.
 
 The bytes of a robot are untrusted: a data server decodes them in a child process with limits, see
-`rse_pf.child.limited`.
+`rse_pf.processes.limited`.
 """
 
 from __future__ import annotations

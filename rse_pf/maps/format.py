@@ -20,7 +20,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.budget import (
+from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, message_of
+from rse_pf.geometry import Array, Camera, rigid
+from rse_pf.limits.budget import (
     LIST_VALUES,
     MAP_VALUES,
     PROVENANCE,
@@ -30,8 +32,6 @@ from rse_pf.budget import (
     measure_msgpack,
     small_text,
 )
-from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, message_of
-from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, common_kind
 
 __all__ = [

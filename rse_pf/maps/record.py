@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rse_pf.object_store import digest_of
+from rse_pf.storage.object_store import digest_of
 
 __all__ = ["MapRecord"]
 

@@ -25,11 +25,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from rse_pf.errors import BadRequest, Busy, Conflict, LimitExceeded, NotFound, StoreError
-from rse_pf.maps.charges import remove_charges
+from rse_pf.identity import name_segment
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.maps.record import MapRecord
 from rse_pf.maps.removal import HELD, MAX_REMOVAL_S, REMOVING, Marks
-from rse_pf.object_store import ObjectStore, digest_of, name_segment
+from rse_pf.storage.charges import remove_charges
+from rse_pf.storage.object_store import ObjectStore, digest_of
 
 if TYPE_CHECKING:  # Importing numpy takes a third of a data server's start, and only decoding a map needs it.
     from rse_pf.maps.format import Keyframe, MapVersion
@@ -710,7 +711,7 @@ def compare_versions(before: MapVersion, after: MapVersion) -> MapDiff:
 def _charge_once(charge: Callable[[int], None], size: int) -> Iterator[None]:
     """Call *charge* with *size* when the context begins; do not undo the charge if the write in it fails.
 
-    `rse_pf.accounts` counts the stored bytes again at intervals, which corrects the charge.
+    `rse_pf.storage.quotas` counts the stored bytes again at intervals, which corrects the charge.
     """
     charge(size)
     yield

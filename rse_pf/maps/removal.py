@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from rse_pf.errors import Busy, StoreError
 from rse_pf.maps.record import MapRecord
-from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of
+from rse_pf.storage.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of
 
 __all__ = [
     "ABANDONED_S",

@@ -15,14 +15,14 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.server.robot_store import store_within_quota
 from rse_pf.service import Registry, Service
+from rse_pf.storage.object_store import ObjectStore, digest_of
+from rse_pf.storage.quotas import Accounts
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 

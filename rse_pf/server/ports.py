@@ -11,8 +11,8 @@ from typing import Any, Protocol
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
+from rse_pf.extensions.recording.tap import RecordingTap
 from rse_pf.identity import RobotId
-from rse_pf.recording.tap import RecordingTap
 from rse_pf.server.log import JsonLog
 from rse_pf.server.metrics import Metrics
 from rse_pf.wire.server_session import ServerSession

@@ -6,11 +6,11 @@ Nothing is removed to make an object fit.
 
 from __future__ import annotations
 
-from rse_pf.accounts import Accounts
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import ObjectStore, digest_of
+from rse_pf.storage.object_store import ObjectStore, digest_of
+from rse_pf.storage.quotas import Accounts
 
 __all__ = ["is_shared", "store_within_quota"]
 

@@ -1,7 +1,7 @@
 """Merge maps: find loop closures, reject outliers, align the maps, optimise the poses, deform the clouds.
 
 `merge_versions` is a function of the maps and the options alone; `rse_pf.services.mapping.merge` is the
-service that robots call, and `rse_pf.batch` runs the same steps in several processes.
+service that robots call, and `rse_pf.extensions.batch` runs the same steps in several processes.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.budget import PROVENANCE, check_msgpack
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse, median_pose
+from rse_pf.limits.budget import PROVENANCE, check_msgpack
 from rse_pf.maps.format import UP_FIELD, Edge, EdgeKind, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.cloud_deform import deform_clouds
@@ -108,7 +108,7 @@ def _select(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeSteps:
-    """The functions of a merge that take long; `rse_pf.batch` replaces them to use several processes.
+    """The functions of a merge that take long; an extension replaces them to use several processes.
 
     Attributes:
         propose: Returns the measured loop closures.
@@ -362,7 +362,7 @@ def _make_provenance(
 ) -> dict[str, Any]:
     """Return the provenance of the merged map, whose ``parents`` are the provenances of *versions*.
 
-    If the result would exceed the limits of a map's provenance (`rse_pf.budget.PROVENANCE`), the field
+    If the result would exceed the limits of a map's provenance (`rse_pf.limits.budget.PROVENANCE`), the field
     ``parents`` of each of these provenances is left out.  If it still would, the result has no field
     ``parents``.
 

@@ -14,7 +14,9 @@ from typing import Any, Protocol, TypeVar, get_args
 
 import msgspec
 
-from rse_pf.budget import (
+from rse_pf.config import SessionSettings
+from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
+from rse_pf.limits.budget import (
     Budget,
     check_json,
     check_json_containers,
@@ -24,8 +26,6 @@ from rse_pf.budget import (
     inflate_up_to,
     inflate_within,
 )
-from rse_pf.config import SessionSettings
-from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
 from rse_pf.wire import arrays
 from rse_pf.wire.messages import Command, FromRobot, FromServer, Message
 

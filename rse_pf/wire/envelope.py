@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rse_pf.budget import Budget, announced_values, measure_msgpack, small_text
 from rse_pf.errors import ProtocolError
+from rse_pf.limits.budget import Budget, announced_values, measure_msgpack, small_text
 from rse_pf.wire.codec import Codec, stored
 from rse_pf.wire.messages import Failure
 

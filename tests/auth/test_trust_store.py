@@ -12,7 +12,7 @@ from rse_pf.auth.tokens import Claims, SigningKey
 from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore, TrustStore, key_set_from_snapshot
 from rse_pf.errors import ConfigurationError, Conflict
 from rse_pf.identity import RobotId
-from rse_pf.object_store import DirectoryStore, MemoryStore
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore
 
 KEY = SigningKey.from_seed(b"p" * 32, "p1")
 CLAIMS = Claims(robot=RobotId("default", "r"), token_id="t", issued_s=0.0, expires_s=9.0, key_id="p1")

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rse_pf.batch.cluster import DaskEngine, LocalCluster
-from rse_pf.batch.merge import BatchMerge
-from rse_pf.batch.parts import Part
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Crashed
+from rse_pf.extensions.batch.cluster import DaskEngine, LocalCluster
+from rse_pf.extensions.batch.merge import BatchMerge
+from rse_pf.extensions.batch.parts import Part
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore
 from rse_pf.slam.map_merge import Atlas, MergeOptions, merge_versions, propose_loop_closures
+from rse_pf.storage.object_store import DirectoryStore
 from tests.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow
@@ -93,7 +93,7 @@ def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
     def compute(settings: bytes, part: bytes) -> None:
         os._exit(3)
 
-    monkeypatch.setattr("rse_pf.batch.cluster.compute", compute)
+    monkeypatch.setattr("rse_pf.extensions.batch.cluster.compute", compute)
     settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
     events: list[str] = []
     cluster = LocalCluster(1, part_tries=2)

@@ -17,7 +17,7 @@ import pytest
 
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 from tests.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow

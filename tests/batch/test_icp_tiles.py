@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from rse_pf.batch.icp_tiles import align_tiles
+from rse_pf.extensions.batch.icp_tiles import align_tiles
 from rse_pf.geometry import Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.loop_closures import Atlas

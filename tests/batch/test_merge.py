@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rse_pf.batch.merge import BatchMerge, BatchMergeResult, strongest
-from rse_pf.batch.parts import PREFIX, Part
-from rse_pf.batch.tasks import strongest_rows
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Disconnected, LimitExceeded
+from rse_pf.extensions.batch.merge import BatchMerge, BatchMergeResult, strongest
+from rse_pf.extensions.batch.parts import PREFIX, Part
+from rse_pf.extensions.batch.tasks import strongest_rows
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import MemoryStore
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_loop_closures
+from rse_pf.storage.object_store import MemoryStore
 from tests.batch.in_process import InProcessEngine
 from tests.synthetic_maps import make_world
 
@@ -128,7 +128,7 @@ def test_progress_never_goes_back() -> None:
 
 def test_too_many_keyframes_are_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     store = a_store()
-    monkeypatch.setattr("rse_pf.batch.merge.MAX_KEYFRAMES", 20)
+    monkeypatch.setattr("rse_pf.extensions.batch.merge.MAX_KEYFRAMES", 20)
 
     with pytest.raises(LimitExceeded, match="20 keyframes"):
         BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES)
@@ -159,7 +159,7 @@ def test_the_strongest_links_are_spread_over_the_keyframes() -> None:
 
 def test_links_that_are_not_compared_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     store = a_store()
-    monkeypatch.setattr("rse_pf.batch.merge.MAX_LINKS_PER_PAIR", 10)
+    monkeypatch.setattr("rse_pf.extensions.batch.merge.MAX_LINKS_PER_PAIR", 10)
 
     found = BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES)
 

@@ -6,7 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.batch.parts import (
+from rse_pf.errors import StoreError
+from rse_pf.extensions.batch.parts import (
     Part,
     PartResult,
     decode_part,
@@ -16,8 +17,7 @@ from rse_pf.batch.parts import (
     put_input,
     read_result,
 )
-from rse_pf.errors import StoreError
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 
 def test_a_part_is_named_by_all_that_it_computes_from() -> None:

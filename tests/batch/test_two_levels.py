@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf.batch.two_levels import graph_between, graphs_within, poses_of_levels, stacked
+from rse_pf.extensions.batch.two_levels import graph_between, graphs_within, poses_of_levels, stacked
 from rse_pf.geometry import exp_se3
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph, robust_cost
 from rse_pf.slam.pose_graph import PoseGraph

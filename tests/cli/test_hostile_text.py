@@ -23,7 +23,7 @@ from rse_pf.local.processes import ProcessMark
 from rse_pf.local.state import PlatformState, ServerState
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.terminal import printable
 from rse_pf.wire import Failure
 

@@ -13,9 +13,9 @@ import pytest
 from recording.replay.made import Made, jpeg
 
 from rse_pf.cli.main import main
+from rse_pf.extensions.recording.mcap_file import McapFile
+from rse_pf.extensions.recording.replay import limited
 from rse_pf.pnp.problems import make_degenerate, make_problem
-from rse_pf.recording.mcap_file import McapFile
-from rse_pf.recording.replay import limited
 from rse_pf.wire import Result
 
 
@@ -35,7 +35,7 @@ class InThisProcess:
     """Stands for the process with limits, which takes half a second to start."""
 
     def __init__(self, target: str, _limits: object, *, configuration: str, **_: object) -> None:
-        assert target == "rse_pf.recording.replay.limited:replayer"
+        assert target == "rse_pf.extensions.recording.replay.limited:replayer"
         self._answer = limited.replayer(configuration)
 
     def call(self, data: bytes, timeout_s: float) -> bytes:

@@ -18,7 +18,7 @@ from rse_pf.geometry import Camera
 from rse_pf.local.firewall import ensure_key
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 __all__ = ["FAILED", "USAGE", "WRONG_INPUTS", "WrongInput", "make_files"]
 

@@ -28,7 +28,7 @@ from rse_pf.auth.tokens import ISSUER, SigningKey
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.errors import Unauthorized
 from rse_pf.local.control.platform import LocalPlatform
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 __all__ = ["SCENARIOS", "Bench", "Missed", "Scenario"]
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.data_server import http
 from rse_pf.errors import Archived, StoreError, StoreFull
-from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, digest_of
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectInfo, digest_of
 
 DATA = bytes(range(256)) * 4
 DIGEST = digest_of(DATA)

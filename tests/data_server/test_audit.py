@@ -15,7 +15,7 @@ from rse_pf.audit.log import AuditLog, read_entries
 from rse_pf.data_server.app import DataServer
 from rse_pf.data_server.server import _write_line
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 MAPS = "/data/v1/maps/kitchen"
 

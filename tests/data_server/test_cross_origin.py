@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fake_data_service import Service, small_settings
 
-from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 PAGE = "https://robots.example.org"
 DATA = b"a keyframe"

@@ -11,7 +11,7 @@ import pytest
 from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.errors import Busy, Conflict, NotFound
-from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)

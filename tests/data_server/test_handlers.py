@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 MAPS = "/data/v1/maps/kitchen"
 

@@ -15,7 +15,7 @@ from rse_pf.data_server.robot_processes import RobotProcesses
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 
 MIB = 1 << 20
 COSTLY = ("ten million empty lists", "one keyframe of 500,000 features", "300 keyframes")

@@ -23,8 +23,8 @@ from rse_pf.data_server.photo_localiser import make_handler  # noqa: E402
 from rse_pf.geometry import Array, exp_se3, pose_difference  # noqa: E402
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map  # noqa: E402
 from rse_pf.maps.registry import MapRegistry  # noqa: E402
-from rse_pf.object_store import DirectoryStore, MemoryStore  # noqa: E402
 from rse_pf.services.mapping.photo import outline_of  # noqa: E402
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore  # noqa: E402
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -10,14 +10,14 @@ import pytest
 from fake_data_service import small_settings
 
 from rse_pf.config import PlatformSettings
-from rse_pf.crash_record import BLOCK_S
 from rse_pf.data_server.map_describer import TARGET, MapDescriber
 from rse_pf.data_server.robot_processes import RobotProcesses
 from rse_pf.errors import Busy, Crashed, RsePfError
 from rse_pf.identity import RobotId
+from rse_pf.limits.crash_record import BLOCK_S
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore, MemoryStore
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore
 
 ROBOT, OTHER = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 EMPTY = MapSummary(keyframes=0, edges=0, points=0, robots=())

@@ -9,7 +9,7 @@ import pytest
 from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 OWNER, RIVAL = "acme", "rival"
 MAPS = "/data/v1/maps/kitchen"

@@ -12,7 +12,7 @@ from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
 from rse_pf.maps.photos import PhotoLens, PhotoLocation
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 ROBOT = RobotId("acme", "robot-1")
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from fake_data_service import Answer, Service, small_settings
 
-from rse_pf.accounts import Accounts
 from rse_pf.config import DataSettings
 from rse_pf.errors import QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
+from rse_pf.storage.quotas import Accounts
 
 ROBOT = RobotId("default", "robot-1")
 

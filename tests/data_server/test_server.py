@@ -14,7 +14,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import REFRESH_S, AccessControlStore
 from rse_pf.data_server import DataServer
 from rse_pf.data_server.server import KeysFile
-from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore, digest_of
 
 ROBOT = SigningKey.of_robot(b"r" * 32)
 

@@ -24,8 +24,8 @@ from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.config import PlatformSettings
 from rse_pf.enrolment import Enrolment
 from rse_pf.local.control.platform import LocalPlatform
-from rse_pf.object_store import DirectoryStore
 from rse_pf.services.custom.installed import install
+from rse_pf.storage.object_store import DirectoryStore
 from tests.client_sdk.delaying_proxy import DelayingProxy
 from tests.examples.example_page import PAGE, REPOSITORY, listed
 

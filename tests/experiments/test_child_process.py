@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 import pytest
 
 from rse_pf.errors import Disconnected
-from rse_pf.experiments.child_process import IssuedToken, ParentPipe, TokenRequest
+from rse_pf.extensions.experiments.child_process import IssuedToken, ParentPipe, TokenRequest
 
 
 def pair(clock: list[float]) -> tuple[ParentPipe, Connection]:

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.fleet_page.app import CONTENT_SECURITY_POLICY, FleetApp, PageAccess, PageActions
-from rse_pf.fleet_page.hub import MAX_PAGES, Hub
-from rse_pf.fleet_page.page_sessions import MAX_SESSIONS, PageSessions
-from rse_pf.fleet_page.static_files import page_files
+from rse_pf.extensions.fleet_page.app import CONTENT_SECURITY_POLICY, FleetApp, PageAccess, PageActions
+from rse_pf.extensions.fleet_page.hub import MAX_PAGES, Hub
+from rse_pf.extensions.fleet_page.page_sessions import MAX_SESSIONS, PageSessions
+from rse_pf.extensions.fleet_page.static_files import page_files
 
 HOST = "127.0.0.1:8701"
 ADMIN = "ab" * 32

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from rse_pf.audit.entry import Entry, entry_line
-from rse_pf.fleet_page.feeds.audit_log import AuditRows, audit_sentence
-from rse_pf.fleet_page.feeds.file_tail import FileTail
+from rse_pf.extensions.fleet_page.feeds.audit_log import AuditRows, audit_sentence
+from rse_pf.extensions.fleet_page.feeds.file_tail import FileTail
 
 
 class Writer:

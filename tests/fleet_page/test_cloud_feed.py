@@ -16,9 +16,9 @@ from rse_pf.aws.fleet.group_metrics import PERIODS, GroupMetrics
 from rse_pf.aws.fleet.overview import CloudBalancer, CloudOverview, ScalingActivity
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, ConfigurationError
-from rse_pf.fleet_page.cloud_page import serve_cloud_page
-from rse_pf.fleet_page.feeds.cloud_feed import CloudFeed, cloud_document, new_events
-from rse_pf.fleet_page.hub import Hub
+from rse_pf.extensions.fleet_page.cloud_page import serve_cloud_page
+from rse_pf.extensions.fleet_page.feeds.cloud_feed import CloudFeed, cloud_document, new_events
+from rse_pf.extensions.fleet_page.hub import Hub
 
 SETTINGS = PlatformSettings()
 NOW_S = 6000.0
@@ -202,7 +202,7 @@ def test_wrong_credentials_are_an_error_before_a_page_is_served() -> None:
 
 
 def test_the_page_of_the_cloud_changes_nothing() -> None:
-    from rse_pf.fleet_page.cloud_page import _operate
+    from rse_pf.extensions.fleet_page.cloud_page import _operate
 
     with pytest.raises(BadRequest, match="only shows"):
         asyncio.run(_operate("kill", {"server": "i-1"}))

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rse_pf.fleet_page.feeds.command_log import CommandLog
+from rse_pf.extensions.fleet_page.feeds.command_log import CommandLog
 
 
 def line(**fields: Any) -> str:

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 
 from rse_pf.auth.roster import check_scopes, scopes_allow
-from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.fleet_page import clouds
-from rse_pf.fleet_page.feeds.events import group_of
-from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories, plain
-from rse_pf.fleet_page.feeds.platform_feed import (
+from rse_pf.extensions.fleet_page import clouds
+from rse_pf.extensions.fleet_page.feeds.events import group_of
+from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories, plain
+from rse_pf.extensions.fleet_page.feeds.platform_feed import (
     LocalFeed,
     fleet_document,
     moved_robots,
 )
-from rse_pf.fleet_page.hub import Hub
+from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.geometry import Camera
 from rse_pf.local.control.operations import Operations
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.processes.limited import LimitedProcesses
+from rse_pf.storage.object_store import DirectoryStore
 
 
 def test_every_text_of_the_fleet_is_escaped() -> None:

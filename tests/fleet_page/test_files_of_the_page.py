@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 
-from rse_pf.fleet_page.static_files import STATIC, vendored
+from rse_pf.extensions.fleet_page.static_files import STATIC, vendored
 
 VENDOR = STATIC / "vendor"
 

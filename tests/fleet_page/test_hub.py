@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import Busy
-from rse_pf.fleet_page.hub import MAX_PAGES, Hub
+from rse_pf.extensions.fleet_page.hub import MAX_PAGES, Hub
 
 ALL = frozenset(("fleet", "event"))
 

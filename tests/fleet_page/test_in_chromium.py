@@ -369,7 +369,7 @@ import numpy as np
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 random = np.random.default_rng(1)
 count = int(sys.argv[2])

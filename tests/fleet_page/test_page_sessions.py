@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from rse_pf.errors import Forbidden, Unauthorized
-from rse_pf.fleet_page.page_sessions import KEY_LIFE_S, MAX_SESSIONS, PageSessions
+from rse_pf.extensions.fleet_page.page_sessions import KEY_LIFE_S, MAX_SESSIONS, PageSessions
 
 
 def sessions() -> PageSessions:

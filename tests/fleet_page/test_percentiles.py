@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from rse_pf.fleet_page.feeds.percentiles import LastMinute, buckets_of, percentile
+from rse_pf.extensions.fleet_page.feeds.percentiles import LastMinute, buckets_of, percentile
 
 PAGE = """
 # TYPE rse_pf_duration_seconds histogram

@@ -7,9 +7,9 @@ from pathlib import Path
 from recording.replay.made import Made
 
 from rse_pf.config import PlatformSettings
-from rse_pf.fleet_page.replays import replay_document
+from rse_pf.extensions.fleet_page.replays import replay_document
+from rse_pf.extensions.recording.replay import run
 from rse_pf.pnp.problems import make_problem
-from rse_pf.recording.replay import run
 
 
 def test_a_weak_pose_shows_its_matches_and_the_rules_that_it_broke(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import random
 import pytest
 
 from rse_pf.config import ScalingSettings
-from rse_pf.fleet_page.feeds.events import event_sentence
-from rse_pf.fleet_page.feeds.sentences import waiting_for
+from rse_pf.extensions.fleet_page.feeds.events import event_sentence
+from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
 from rse_pf.scaling.policy import FleetState, Sample, decide
 
 SETTINGS = ScalingSettings()

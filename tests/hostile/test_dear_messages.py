@@ -13,9 +13,9 @@ import pytest
 
 from fuzz.meter import MAX_MIB, MAX_MS, Meter
 from fuzz.samples import EXPENSIVE, MAX_INPUT_BYTES
-from rse_pf import budget
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import ProtocolError
+from rse_pf.limits import budget
 from rse_pf.pnp.problems import KINECT, make_problem
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services

@@ -18,8 +18,8 @@ from hostile.hostile_maps import hostile_maps
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError
-from rse_pf.fleet_page.clouds import packer
-from rse_pf.map_export.single_files import SINGLE_FILE_FORMATS, encode_single_file
+from rse_pf.extensions.fleet_page.clouds import packer
+from rse_pf.extensions.map_export.single_files import SINGLE_FILE_FORMATS, encode_single_file
 from rse_pf.maps.describe import describe_map
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch

@@ -21,9 +21,9 @@ from recording.replay.made import Made, jpeg
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
+from rse_pf.extensions.recording import file_format
+from rse_pf.extensions.recording.replay.limited import LimitedReplay
 from rse_pf.pnp.problems import make_problem
-from rse_pf.recording import file_format
-from rse_pf.recording.replay.limited import LimitedReplay
 
 pytest.importorskip("mcap", reason="pip install 'rse-pf[local]'")
 

@@ -93,8 +93,11 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/recording/test_redact.py", "Secret Keyword"): "the same",
     ("tests/recording/test_told_content.py", "JSON Web Token"): "the same",
     ("tests/recording/replay/test_case.py", "Secret Keyword"): "a name, to be kept out of a case",
-    ("rse_pf/fleet_page/static/vendor/vendored.json", "Hex High Entropy String"): "digests of the files",
-    ("tests/test_object_store.py", "Hex High Entropy String"): "the sha256 of 'abc'",
+    (
+        "rse_pf/extensions/fleet_page/static/vendor/vendored.json",
+        "Hex High Entropy String",
+    ): "digests of the files",
+    ("tests/storage/test_object_store.py", "Hex High Entropy String"): "the sha256 of 'abc'",
     ("tests/fixtures/expected_07e5efc6.json", "Hex High Entropy String"): "digests of maps and objects",
 }
 """File and kind of detect-secrets to why it is none."""

@@ -258,7 +258,7 @@ def test_the_oldest_logs_of_ended_processes_are_removed_and_nothing_else(tmp_pat
 _PARENT_OF_ORPHANS = """
 import asyncio, sys
 from pathlib import Path
-from rse_pf.linux import PR_SET_CHILD_SUBREAPER, prctl
+from rse_pf.processes.linux import PR_SET_CHILD_SUBREAPER, prctl
 from rse_pf.local.processes import reap_orphans, spawn
 
 async def main() -> None:

@@ -21,8 +21,8 @@ from localstack.conftest import SETTINGS, Deployment
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.aws.fleet.tasks import server_metrics, store_errors
-from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.storage.object_store import MemoryStore
 
 NOT_EVALUATED = {
     "balancer-errors",

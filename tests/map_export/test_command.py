@@ -17,7 +17,7 @@ from rse_pf.cli.main import main
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
-from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 
 FORMATS = ("colmap", "nerfstudio", "occupancy", "ply", "pcd", "tum", "g2o")
 WRITTEN = {

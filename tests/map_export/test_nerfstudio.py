@@ -10,8 +10,8 @@ import pytest
 from map_export.exact_maps import OTHER_CAMERA, points_map
 
 from rse_pf.errors import UsageError
+from rse_pf.extensions.map_export.nerfstudio import encode_nerfstudio
 from rse_pf.geometry import inverse, transform
-from rse_pf.map_export.nerfstudio import encode_nerfstudio
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.ply import decode_ply
 

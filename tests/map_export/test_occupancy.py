@@ -9,8 +9,7 @@ import pytest
 from map_export.exact_maps import CAMERA, shares_right, world_map
 
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
-from rse_pf.map_export.occupancy import (
+from rse_pf.extensions.map_export.occupancy import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -19,6 +18,7 @@ from rse_pf.map_export.occupancy import (
     encode_occupancy,
     make_occupancy_grid,
 )
+from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.level_surfaces import floor_normal, level_surface_normal
 

@@ -7,8 +7,8 @@ import pytest
 from maps.sample_maps import make_map
 
 from rse_pf.errors import UsageError
+from rse_pf.extensions.map_export.single_files import encode_single_file
 from rse_pf.geometry import transform
-from rse_pf.map_export.single_files import encode_single_file
 from rse_pf.slam.ply import decode_ply
 from rse_pf.slam.pose_graph import read_g2o
 

@@ -19,7 +19,7 @@ from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry, compare_versions
-from rse_pf.object_store import DirectoryStore, MemoryStore
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore
 
 
 def commit(maps: MapRegistry, seed: int, parent: str | None) -> str:
@@ -129,7 +129,7 @@ def test_a_difference_names_what_was_added_removed_and_moved() -> None:
 _KILLED = """
 import os, pathlib, signal, sys
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 step, folder, data, parent = int(sys.argv[1]), sys.argv[2], open(sys.argv[3], "rb").read(), sys.argv[4]
 count = 0
 for name in ("fsync", "replace"):

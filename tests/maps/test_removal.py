@@ -15,11 +15,11 @@ from maps.sample_maps import make_map
 
 from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull
 from rse_pf.identity import RobotId
-from rse_pf.maps.charges import charge_name, sum_charges
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import ABANDONED_S, MAX_REMOVAL_S, Marks, choose_superseded, count_freed_bytes
-from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage
+from rse_pf.storage.charges import charge_name, sum_charges
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage
 
 NAME, FOLDER = "kitchen", "maps/default/kitchen/"
 ROBOT = RobotId("default", "robot-1")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.results.summary import percentiles
+from rse_pf.extensions.experiments.results.summary import percentiles
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, WeakLimits, engines, solve_pnp
 from rse_pf.pnp.native_solver import Evidence, native_solver

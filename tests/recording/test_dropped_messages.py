@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from typing import Any, cast
 
-from rse_pf.recording.recorder_process import MessageRecorder, PipeRecorder
-from rse_pf.recording.tap import _ENTRY, LOST
+from rse_pf.extensions.recording.recorder_process import MessageRecorder, PipeRecorder
+from rse_pf.extensions.recording.tap import _ENTRY, LOST
 
 
 class Events:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from rse_pf.recording.mcap_file import McapFile
+from rse_pf.extensions.recording.mcap_file import McapFile
 
 SECOND = 1_000_000_000
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from rse_pf.recording.file_format import POINTS_SCHEMA, POSE_SCHEMA, SCHEMAS, encode_json
-from rse_pf.recording.poses import inverse, point_cloud, pose_in_frame, read_answered_pose
+from rse_pf.extensions.recording.file_format import POINTS_SCHEMA, POSE_SCHEMA, SCHEMAS, encode_json
+from rse_pf.extensions.recording.poses import inverse, point_cloud, pose_in_frame, read_answered_pose
 from rse_pf.services.pnp import PnpReply
 from rse_pf.wire import Result, make_codec
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from rse_pf.extensions.recording.redact import PROTOCOL_WORDS, ConnectionRedactor, Pseudonyms
 from rse_pf.identity import RobotId
 from rse_pf.pnp import PnpOptions
-from rse_pf.recording.redact import PROTOCOL_WORDS, ConnectionRedactor, Pseudonyms
 from rse_pf.services.mapping.icp import IcpReply, IcpRequest
 from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import (

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.recording.recorder_process import RecorderPlan
+from rse_pf.extensions.recording.tap import LOST, OPENED, UP, Handed, PipeReader, RecordingTap, hand_pipe
 from rse_pf.identity import RobotId
-from rse_pf.recording.recorder_process import RecorderPlan
-from rse_pf.recording.tap import LOST, OPENED, UP, Handed, PipeReader, RecordingTap, hand_pipe
 from rse_pf.server.supervisor.server_recording import ServerRecording
 
 ROBOT = RobotId("default", "robot-1")

@@ -19,10 +19,10 @@ import client_sdk
 from client_sdk.frontend import Frame
 from rse_pf.config import PnpSettings, SessionSettings
 from rse_pf.errors import MissingExtra, UsageError
+from rse_pf.extensions.recording.reader import open_recording
+from rse_pf.extensions.recording.robot_recorder import RobotRecorder
 from rse_pf.geometry import Camera
 from rse_pf.pnp.problems import make_problem
-from rse_pf.recording.reader import open_recording
-from rse_pf.recording.robot_recorder import RobotRecorder
 from rse_pf.services import pnp
 
 TOKEN = "eyJhbGciOiJFZERTQSJ9." + base64.urlsafe_b64encode(b'{"tenant":"acme"}').decode() + ".c2lnbmVkYnl1cw"

@@ -22,8 +22,8 @@ from mcap.stream_reader import StreamReader
 
 from client_sdk import connect
 from rse_pf.errors import RsePfError
+from rse_pf.extensions.recording.reader import open_recording
 from rse_pf.pnp.problems import make_problem
-from rse_pf.recording.reader import open_recording
 from rse_pf.wire import CODECS
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]

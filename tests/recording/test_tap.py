@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from rse_pf.identity import RobotId
-from rse_pf.recording.tap import (
+from rse_pf.extensions.recording.tap import (
     CLOSED,
     DOWN,
     LOST,
@@ -21,6 +20,7 @@ from rse_pf.recording.tap import (
     RecordingTap,
     recording_pipe,
 )
+from rse_pf.identity import RobotId
 
 ROBOT = RobotId("default", "robot-1")
 

@@ -13,12 +13,21 @@ from mcap.reader import make_reader
 from server.gateway.worker_parts import worker_parts
 
 from rse_pf.config import PlatformSettings, SessionSettings
+from rse_pf.extensions.recording.recorder_process import MessageRecorder
+from rse_pf.extensions.recording.redact import ConnectionRedactor, Pseudonyms
+from rse_pf.extensions.recording.tap import (
+    DOWN,
+    PLAIN,
+    POSE,
+    UP,
+    Handed,
+    PipeReader,
+    RecordingTap,
+    recording_pipe,
+)
+from rse_pf.extensions.recording.writer import RecordingWriter
 from rse_pf.identity import RobotId
 from rse_pf.pnp.problems import make_problem
-from rse_pf.recording.recorder_process import MessageRecorder
-from rse_pf.recording.redact import ConnectionRedactor, Pseudonyms
-from rse_pf.recording.tap import DOWN, PLAIN, POSE, UP, Handed, PipeReader, RecordingTap, recording_pipe
-from rse_pf.recording.writer import RecordingWriter
 from rse_pf.service import Registry
 from rse_pf.services import pnp
 from rse_pf.wire import CODECS, Command, Ping, make_codec

@@ -17,8 +17,8 @@ from mcap.stream_reader import StreamReader
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.recording.file_format import FileName
-from rse_pf.recording.writer import RecordingWriter, make_folder, with_recordings
+from rse_pf.extensions.recording.file_format import FileName
+from rse_pf.extensions.recording.writer import RecordingWriter, make_folder, with_recordings
 
 START = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000

@@ -12,7 +12,7 @@ from guarded_server import GuardedServer
 from rosbridge.clients import Bridge
 
 from rse_pf.config import PlatformSettings
-from rse_pf.rosbridge.server import open_rosbridge
+from rse_pf.extensions.rosbridge.server import open_rosbridge
 
 UNLIMITED = {"max_commands_per_s": 0.0}
 

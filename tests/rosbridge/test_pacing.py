@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rse_pf.rosbridge.pacing import Pacing
+from rse_pf.extensions.rosbridge.pacing import Pacing
 
 
 def until_free(pacing: Pacing, now: float, round_trip_s: float) -> float:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.rosbridge import subscription as subscriptions
-from rse_pf.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
+from rse_pf.extensions.rosbridge import subscription as subscriptions
+from rse_pf.extensions.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
 
 
 def test_what_waits_for_one_subscription_is_bounded_in_number_and_bytes() -> None:

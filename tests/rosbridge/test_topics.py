@@ -11,9 +11,9 @@ from guarded_server import GuardedServer
 from rosbridge.clients import Client, call, publish, subscribe
 from rosbridge.conftest import opened
 
-from rse_pf.rosbridge import topics as limits
-from rse_pf.rosbridge.client import Client as RosbridgeClient
-from rse_pf.rosbridge.subscription import Subscription, TopicMessage
+from rse_pf.extensions.rosbridge import topics as limits
+from rse_pf.extensions.rosbridge.client import Client as RosbridgeClient
+from rse_pf.extensions.rosbridge.subscription import Subscription, TopicMessage
 
 HOUR_MS = 3_600_000
 

@@ -12,10 +12,10 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import TooFewCorrespondences
 from rse_pf.identity import RobotId
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.gateway.stateless_queue import StatelessQueue
 from rse_pf.server.scheduling.scheduler import INLINE_BYTES
 from rse_pf.service import Registry
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command
 
 SETTINGS = PlatformSettings.from_dict({"session": {"max_message_bytes": 65536}})

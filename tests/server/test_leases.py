@@ -9,11 +9,11 @@ from collections.abc import Callable
 import pytest
 
 from rse_pf.errors import Conflict, NotFound, StoreError
-from rse_pf.lease import Lease
 from rse_pf.server.jobs.lease import JobLease, JobRecord
 from rse_pf.server.jobs.lease import verdict_on as verdict_on_job
 from rse_pf.server.live_map.lease import MapLease, decode_lease
 from rse_pf.server.live_map.lease import next_action as verdict_on_map
+from rse_pf.storage.lease import Lease
 
 LEASE_S = 1.5
 NAME = "lease"

@@ -10,12 +10,12 @@ import pytest
 from rse_pf.config import DataSettings, PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, RsePfError, StoreError
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import MemoryStore, ObjectInfo, digest_of
 from rse_pf.server.object_refs import ObjectRefs, named_in, resolve, takes_objects
 from rse_pf.service import Registry
 from rse_pf.services.mapping.localise import LocaliseRequest
 from rse_pf.services.mapping.merge import MergeRequest
 from rse_pf.services.pnp import PnpRequest
+from rse_pf.storage.object_store import MemoryStore, ObjectInfo, digest_of
 from rse_pf.wire import Command
 
 ROBOT = RobotId("lab", "robot-1")

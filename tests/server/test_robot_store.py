@@ -5,16 +5,16 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings, PlatformSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
-from rse_pf.maps.charges import charge_name
-from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 from rse_pf.server.jobs.process import JobRequest, store_reply
 from rse_pf.server.object_refs import ObjectRefs
 from rse_pf.server.robot_store import store_within_quota
+from rse_pf.storage.charges import charge_name
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore, digest_of
+from rse_pf.storage.quotas import Accounts
 from rse_pf.wire import Failure, Result
 
 ROBOT = RobotId("default", "robot-1")

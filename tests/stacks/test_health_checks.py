@@ -24,9 +24,9 @@ from rse_pf.aws.clients import make_client
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH, ROSBRIDGE_PORT
 from rse_pf.errors import StoreError
-from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, cloud_checks
+from rse_pf.storage.object_store import MemoryStore, digest_of
 from tests.stacks.played_s3 import PlayedS3
 
 Assembly = Any

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from rse_pf.budget import MESSAGE_CONTAINERS, MESSAGE_DEPTH
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError, UnsupportedProtocol
+from rse_pf.limits.budget import MESSAGE_CONTAINERS, MESSAGE_DEPTH
 from rse_pf.wire import (
     CODECS,
     SUBPROTOCOLS,

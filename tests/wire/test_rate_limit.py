@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from wire.client_sessions import open_connection
 
 from rse_pf.config import SessionSettings
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.wire import Command, Limits, Ping, Result, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
 from rse_pf.wire.rate_limit import RateLimiter

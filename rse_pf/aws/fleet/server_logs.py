@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from rse_pf.aws.account import Account
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import JOURNAL_PREFIX, ResourceNames
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["LoggedServer", "console_of", "last_lines", "list_logged_servers", "open_journals"]
 

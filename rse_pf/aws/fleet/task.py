@@ -17,7 +17,7 @@ from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.journal import JournalReader
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.config import PlatformSettings
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["ALWAYS", "AgentConfig", "AgentContext", "AgentState", "Phase", "Task"]
 

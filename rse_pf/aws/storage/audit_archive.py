@@ -28,8 +28,8 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import AUDIT_PREFIX, ResourceNames
 from rse_pf.errors import Conflict
-from rse_pf.files import replace_json
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.files import replace_json
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["Shipper", "fetch_audit", "open_audit_archive"]
 

@@ -1,4 +1,4 @@
-"""An object store in one S3 bucket, with the contract of `rse_pf.object_store.ObjectStore`.
+"""An object store in one S3 bucket, with the contract of `rse_pf.storage.object_store.ObjectStore`.
 
 A compare-and-swap is a conditional write of S3, so only one of two servers succeeds.  A presigned URL fixes
 name, length and sha256 of what may be stored, so a robot can upload exactly these bytes with it.  Names that
@@ -16,7 +16,7 @@ from typing import Any
 from rse_pf.aws.clients import error_code, make_client, status_of, with_retries
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Archived, Conflict, NotFound, StoreError, StoreFull, StoreRefused
-from rse_pf.object_store import ObjectInfo, ObjectStore, Usage, check_name, open_store, usage_of
+from rse_pf.storage.object_store import ObjectInfo, ObjectStore, Usage, check_name, open_store, usage_of
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
 

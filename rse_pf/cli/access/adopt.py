@@ -22,7 +22,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
 from rse_pf.local.state import state_folder
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.terminal import counted, show
 
 __all__ = ["Adopted", "adopt", "run_adopt"]

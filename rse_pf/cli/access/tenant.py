@@ -19,7 +19,6 @@ import argparse
 from collections import Counter
 from typing import Any
 
-from rse_pf.accounts import TenantAccount, own_quota_bytes, set_own_quota, stored_by_tenant, tenant_folders
 from rse_pf.auth.roster import check_tenant
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.aws.storage import S3Store, open_data_store
@@ -33,7 +32,15 @@ from rse_pf.cli.maps.map_store import with_store
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
-from rse_pf.object_store import ObjectStore, name_segment
+from rse_pf.identity import name_segment
+from rse_pf.storage.object_store import ObjectStore
+from rse_pf.storage.quotas import (
+    TenantAccount,
+    own_quota_bytes,
+    set_own_quota,
+    stored_by_tenant,
+    tenant_folders,
+)
 from rse_pf.terminal import show, show_json
 
 __all__ = ["add_arguments", "run"]

@@ -46,8 +46,8 @@ from rse_pf.cli.access.access_control import (
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
-from rse_pf.files import OWNER_ONLY, replace_file
 from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.storage.files import OWNER_ONLY, replace_file
 from rse_pf.terminal import format_time, show, show_json
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> t
 def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
     """Return the named or the platform's public keys with roster and deny list; None if there are none."""
     from rse_pf.local.firewall import key_set_file
-    from rse_pf.object_store import DirectoryStore
+    from rse_pf.storage.object_store import DirectoryStore
 
     if args.cloud:
         store = _key_store(settings)

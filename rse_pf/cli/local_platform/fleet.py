@@ -62,7 +62,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _run_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
     require("fleet --cloud")
     from rse_pf.aws.account import open_account
-    from rse_pf.fleet_page.cloud_page import serve_cloud_page
+    from rse_pf.extensions.fleet_page.cloud_page import serve_cloud_page
 
     if args.operate:
         raise UsageError("--operate is for a local platform", hint="see docs/operations.md")

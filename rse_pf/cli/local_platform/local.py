@@ -153,7 +153,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _on_running(args, folder)
     require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
-    from rse_pf.recording.writer import with_recordings
+    from rse_pf.extensions.recording.writer import with_recordings
 
     overrides = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
     chosen = settings.replace(local={name: value for name, value in overrides.items() if value is not None})
@@ -469,7 +469,7 @@ def _lan_lines(platform: Any, which: str) -> list[str]:
 
 def _show(event: Any) -> None:
     from rse_pf.cli.local_platform.logs import local_time
-    from rse_pf.fleet_page.feeds.events import EVENTS, event_sentence
+    from rse_pf.extensions.fleet_page.feeds.events import EVENTS, event_sentence
 
     if event["event"] in EVENTS and event["event"] not in _QUIET:
         show(f"{local_time(time.time())}  {event_sentence(event)}")

@@ -14,7 +14,7 @@ from typing import Any
 
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.errors import CommandFailed, UsageError
-from rse_pf.fleet_page.server import ANNOUNCEMENT, page_url
+from rse_pf.extensions.fleet_page.server import ANNOUNCEMENT, page_url
 from rse_pf.local.state import control_token_file
 
 __all__ = ["new_address", "page_beside", "process_beside"]
@@ -27,7 +27,7 @@ _TIMEOUT_S = 5.0
 @contextlib.asynccontextmanager
 async def page_beside(folder: Path, port: int, told: Callable[[str], None]) -> AsyncIterator[None]:
     """Run the page of the platform in *folder*; its address is told when it serves."""
-    async with process_beside("rse_pf.fleet_page", folder, port, folder / _LOG, told):
+    async with process_beside("rse_pf.extensions.fleet_page", folder, port, folder / _LOG, told):
         yield
 
 

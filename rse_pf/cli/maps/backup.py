@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from rse_pf.accounts import TenantAccount
 from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.maps.map_store import open_maps
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, check_exists, sync_folder
 from rse_pf.maps.backup import BackupContent, CheckedBackup, check_backup, restore_backup, write_backup
+from rse_pf.storage.files import OWNER_ONLY, TEMPORARY_PREFIX, check_exists, sync_folder
+from rse_pf.storage.quotas import TenantAccount
 from rse_pf.terminal import at_work, counted, show, show_json
 
 __all__ = ["add_backup_arguments", "add_restore_arguments", "run_backup", "run_restore"]

@@ -25,9 +25,9 @@ from rse_pf.cli.maps.map_store import add_keep_arguments, drive_store, keep_map,
 from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
-from rse_pf.files import replace_file
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.maps.format import IMAGES_FOLDER, decode_map
+from rse_pf.storage.files import replace_file
 from rse_pf.terminal import show, show_progress
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def errors_of(
     path: Trajectory, truth: Trajectory | None, kind: str, T_body_camera: Array | None = None
 ) -> dict[str, Any]:
     """Return the errors of a path against what *kind* names, for a report; of the body where one is given."""
-    from rse_pf.experiments.results.trajectory_error import trajectory_figures
+    from rse_pf.extensions.experiments.results.trajectory_error import trajectory_figures
 
     return {"truth": kind, **trajectory_figures(path, truth, T_body_camera)}
 
@@ -177,8 +177,8 @@ def map_source(
             f"{args.source} has {what}, so that its scale is known",
             hint=f"leave out --scale, or add {option}",
         )
-    from rse_pf.experiments.plots.map_image import RobotPath, draw_map
-    from rse_pf.experiments.results.markdown import lost_line
+    from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
+    from rse_pf.extensions.experiments.results.markdown import lost_line
 
     _make_folder(args.out)
     kept_in = drive_store(args, settings)
@@ -388,7 +388,7 @@ async def _robot(args: argparse.Namespace, settings: PlatformSettings) -> AsyncI
         async with connect(args.url, token=token, settings=settings.session) as robot:
             yield robot
     else:
-        from rse_pf.experiments.results.result_folder import remove_keys
+        from rse_pf.extensions.experiments.results.result_folder import remove_keys
         from rse_pf.local.control.platform import LocalPlatform
 
         folder = args.out / "platform"

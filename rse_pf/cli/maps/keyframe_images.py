@@ -11,8 +11,8 @@ import numpy as np
 
 from client_sdk.frontend import TrackedFrame, load_opencv
 from rse_pf.errors import UsageError
-from rse_pf.files import replace_file
 from rse_pf.maps.format import IMAGES_FOLDER, MapVersion
+from rse_pf.storage.files import replace_file
 
 __all__ = ["KeyframeImages"]
 

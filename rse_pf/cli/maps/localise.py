@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 
 from rse_pf.errors import UsageError
-from rse_pf.files import read_regular_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.descriptors import check_same_kind
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.photos import PhotoLens, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
+from rse_pf.storage.files import read_regular_file
 from rse_pf.terminal import at_work, show, show_json
 
 if TYPE_CHECKING:

@@ -45,7 +45,7 @@ from rse_pf.cli.maps.map_store import open_maps, with_store
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
-from rse_pf.map_export.command import add_export_arguments, run_export
+from rse_pf.extensions.map_export.command import add_export_arguments, run_export
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, compare_versions
 from rse_pf.maps.removal import choose_superseded, count_freed_bytes
 from rse_pf.terminal import at_work, counted, format_time, show, show_json
@@ -314,7 +314,7 @@ def _prune(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
-    from rse_pf.experiments.plots.map_image import RobotPath, draw_map
+    from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 
     _check_folder(args.png)
     version = maps.load(args.name, record.id)

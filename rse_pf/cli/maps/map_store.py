@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rse_pf.accounts import TenantAccount
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
@@ -22,6 +21,7 @@ from rse_pf.identity import RobotId
 from rse_pf.local.processes import is_alive
 from rse_pf.local.state import platform_settings, read_state, state_folder
 from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.storage.quotas import TenantAccount
 
 __all__ = ["add_keep_arguments", "drive_store", "keep_map", "map_name", "open_maps", "with_store"]
 

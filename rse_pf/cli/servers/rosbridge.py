@@ -38,7 +38,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a signal ends the process."""
     if args.announce is not None and not args.announce.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {args.announce.absolute().parent}", hint="create the folder")
-    from rse_pf.rosbridge.server import serve_rosbridge
+    from rse_pf.extensions.rosbridge.server import serve_rosbridge
 
     url = args.url or f"ws://127.0.0.1:{settings.serving.port}{ROBOTS_PATH}"
     return serve_rosbridge(settings, url=url, host=args.host, port=args.port, announce=args.announce)

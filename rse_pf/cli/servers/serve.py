@@ -19,7 +19,7 @@ from rse_pf.auth.trust_store import TrustStore
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import UsageError
-from rse_pf.recording.writer import with_recordings
+from rse_pf.extensions.recording.writer import with_recordings
 
 __all__ = ["add_arguments", "run"]
 

@@ -15,7 +15,6 @@ from rse_pf.cli.services.building import built_service
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
-from rse_pf.object_store import ObjectStore
 from rse_pf.services.custom.installed import install
 from rse_pf.services.custom.publishing import (
     LIST_POLL_PERIOD_S,
@@ -24,6 +23,7 @@ from rse_pf.services.custom.publishing import (
     read_list,
     unpublish,
 )
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.terminal import show, show_json
 
 __all__ = ["add_publish_arguments", "publish_service"]

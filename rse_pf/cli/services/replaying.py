@@ -11,9 +11,9 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.files import read_document
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.output import format_output_line
+from rse_pf.storage.files import read_document
 from rse_pf.terminal import counted, show
 
 __all__ = ["Recorded", "plain", "recorded_requests", "replay"]

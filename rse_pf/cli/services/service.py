@@ -49,11 +49,11 @@ from rse_pf.cli.services.publishing import add_publish_arguments, publish_servic
 from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.files import read_document
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import NAME_PATTERN, install, installed_services
 from rse_pf.services.custom.output import format_output_line
+from rse_pf.storage.files import read_document
 from rse_pf.terminal import error_lines, show, show_json, show_progress
 
 __all__ = ["add_arguments", "run"]

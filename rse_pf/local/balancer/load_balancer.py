@@ -20,7 +20,6 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.files import replace_file, replace_json
 from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
     CLUSTER,
@@ -34,6 +33,7 @@ from rse_pf.local.balancer.envoy_config import (
 )
 from rse_pf.local.lan.listener import LanListener
 from rse_pf.local.processes import ProcessMark, ServerProcess
+from rse_pf.storage.files import replace_file, replace_json
 
 __all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
 

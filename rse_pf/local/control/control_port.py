@@ -1,4 +1,4 @@
-"""The pages and operations of the control plane on its control port (`rse_pf.control_http`), on loopback.
+"""The pages and operations of the control plane on its `rse_pf.http.control_port`, on loopback.
 
 ``GET /status`` is JSON, ``GET /metrics`` is for Prometheus; ``POST /drain?server=NAME`` and ``POST /roll``
 are answered with the events of the operation, one JSON object a line, until it is over; ``GET /watch`` with
@@ -13,9 +13,9 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 
 from rse_pf.auth.control_token import carries_token
-from rse_pf.control_http import ControlReply, ControlRequest, json_reply, serve_control
 from rse_pf.errors import RsePfError
-from rse_pf.silent_connections import FIRST_REQUEST_S
+from rse_pf.http.control_port import ControlReply, ControlRequest, json_reply, serve_control
+from rse_pf.http.unauthenticated import FIRST_REQUEST_S
 
 __all__ = ["METRICS_TYPE", "Page", "serve_control_port"]
 

@@ -24,7 +24,6 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ROBOTS_PATH
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.files import replace_json
 from rse_pf.local.balancer.envoy_config import DATA_CLUSTER, ROSBRIDGE_CLUSTER
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.audit_recorder import PlatformAudit
@@ -66,6 +65,7 @@ from rse_pf.local.state import (
     state_file,
 )
 from rse_pf.local.together import run_together
+from rse_pf.storage.files import replace_json
 
 __all__ = ["LocalPlatform"]
 

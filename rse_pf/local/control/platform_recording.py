@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.files import create_private_file
+from rse_pf.extensions.recording.file_format import EVENT_SCHEMA, EVENTS_TOPIC, SAMPLE_SCHEMA, SAMPLES_TOPIC
+from rse_pf.extensions.recording.writer import RecordingWriter
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.state import recording_key_file
-from rse_pf.recording.file_format import EVENT_SCHEMA, EVENTS_TOPIC, SAMPLE_SCHEMA, SAMPLES_TOPIC
-from rse_pf.recording.writer import RecordingWriter
+from rse_pf.storage.files import create_private_file
 
 __all__ = ["PlatformRecording"]
 

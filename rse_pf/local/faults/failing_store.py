@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import StoreError
-from rse_pf.files import replace_file
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.files import replace_file
+from rse_pf.storage.object_store import DirectoryStore
 
 __all__ = ["failing_environment", "install", "set_failing_percent"]
 

@@ -22,8 +22,8 @@ from rse_pf.auth.certificates import (
     make_authority,
 )
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 from rse_pf.local.lan.addresses import host_names
+from rse_pf.storage.files import OWNER_ONLY, read_private_file, replace_file
 
 __all__ = ["CERTIFICATE_NAME", "LanListener", "authority_file", "secret_document", "secret_file"]
 

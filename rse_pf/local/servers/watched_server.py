@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError
-from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ServerProcess
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import ServerState
+from rse_pf.processes.linux import run_as_batch
 
 __all__ = ["CHECK_S", "NICENESS", "WatchedServer"]
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import traceback
 
-from rse_pf.child.limited import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.config import PlatformSettings
-from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Busy, Crashed, Expired, InternalError, RsePfError
-from rse_pf.linux import cpu_seconds
+from rse_pf.limits.crash_record import CrashRecord
+from rse_pf.processes.limited import LimitedProcesses, Overran, ProcessLimits
+from rse_pf.processes.linux import cpu_seconds
 from rse_pf.server.compute.process import TARGET, configuration_of, decode_reply, encode_request
 from rse_pf.server.ports import WorkerContext
 from rse_pf.server.scheduling.scheduler import QueuedCommand

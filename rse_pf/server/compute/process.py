@@ -14,15 +14,15 @@ import traceback
 import msgspec
 
 from rse_pf.aws.storage import open_data_store
-from rse_pf.child.limited import Handler
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, InternalError, LimitExceeded, MissingExtra, RsePfError, message_of
 from rse_pf.identity import RobotId
-from rse_pf.object_store import ObjectStore
+from rse_pf.processes.limited import Handler
 from rse_pf.server.object_refs import resolve
 from rse_pf.server.robot_store import is_shared
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services.loading import load_services
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError, UnknownService
-from rse_pf.recording.tap import RecordingTap
+from rse_pf.extensions.recording.tap import RecordingTap
 from rse_pf.server.gateway.admission import UnreadRefusal
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.object_refs import ObjectRefs, takes_objects

@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 from rse_pf.config import SessionSettings
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = [
     "CLOSE_INVALID_TEXT",

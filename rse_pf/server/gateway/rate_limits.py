@@ -15,7 +15,7 @@ from typing import TypeVar
 from rse_pf.auth.claimed import source_address
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.wire.rate_limit import command_burst
 
 __all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RATE_BAN_S", "RobotRates", "SourceRates"]

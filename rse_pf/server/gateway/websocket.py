@@ -21,6 +21,7 @@ from picows import picows as _picows
 from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.origins import carried_token
 from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES, WRITE_BUFFER_BYTES
+from rse_pf.http.unauthenticated import PendingHandshakes
 from rse_pf.server.gateway.audit_recorder import AuditRecorder
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.dispatcher import Dispatcher
@@ -37,7 +38,6 @@ from rse_pf.server.gateway.handshake import (
 from rse_pf.server.gateway.rate_limits import SourceRates
 from rse_pf.server.gateway.socket_poller import SocketPoller
 from rse_pf.server.scheduling.deferred_work import DeferredWork
-from rse_pf.silent_connections import PendingHandshakes
 
 picows: Any = _picows  # its stubs lack what is used here
 

@@ -1,4 +1,4 @@
-"""The record of a job, and who may run it: what a lease (`rse_pf.lease`) means for jobs.
+"""The record of a job, and who may run it: what a lease (`rse_pf.storage.lease`) means for jobs.
 
 Nobody looks for jobs without an owner: one that lost its owner begins anew where its robot asks again.
 """
@@ -13,8 +13,8 @@ import msgspec
 
 from rse_pf.errors import BadMessage, BadRequest, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.lease import Lease
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.lease import Lease
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = [

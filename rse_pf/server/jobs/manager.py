@@ -21,8 +21,8 @@ import msgspec
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
-from rse_pf.fair_queue import largest_holder
 from rse_pf.identity import RobotId
+from rse_pf.limits.fair_queue import largest_holder
 from rse_pf.server.jobs.lease import job_key
 from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.record_gc import RECORD_TTL_S, RecordCollector

@@ -18,9 +18,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rse_pf.accounts import Accounts
 from rse_pf.aws.storage import open_data_store
-from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
     BadMessage,
@@ -32,11 +30,13 @@ from rse_pf.errors import (
     message_of,
 )
 from rse_pf.identity import RobotId
-from rse_pf.ipc import encode_message, receive
+from rse_pf.processes.ipc import encode_message, receive
+from rse_pf.processes.start import Child, ChildPlan, start_child
 from rse_pf.server.object_refs import named_in, resolve
 from rse_pf.server.robot_store import is_shared, store_within_quota
 from rse_pf.service import dispatch, failure_of
 from rse_pf.services.loading import load_services
+from rse_pf.storage.quotas import Accounts
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import msgspec
 
 from rse_pf.errors import StoreError
-from rse_pf.lease import Lease
-from rse_pf.object_store import ObjectStore
 from rse_pf.server.jobs.lease import JobRecord, decode_record
+from rse_pf.storage.lease import Lease
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["RECORD_TTL_S", "RecordCollector"]
 

@@ -15,8 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from rse_pf.accounts import Accounts
-from rse_pf.child.start import Child, how_ended
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
     Cancelled,
@@ -31,13 +29,15 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import object_name
-from rse_pf.ipc import FrameReader
-from rse_pf.linux import cpu_seconds
-from rse_pf.object_store import ObjectStore, digest_of
+from rse_pf.processes.ipc import FrameReader
+from rse_pf.processes.linux import cpu_seconds
+from rse_pf.processes.start import Child, how_ended
 from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, renewal_s, verdict_on
 from rse_pf.server.jobs.process import JobRequest, inline_bytes, retry_store
 from rse_pf.server.jobs.slots import JobSlots
 from rse_pf.server.robot_store import store_within_quota
+from rse_pf.storage.object_store import ObjectStore, digest_of
+from rse_pf.storage.quotas import Accounts
 
 __all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
 

@@ -11,8 +11,8 @@ import os
 import threading
 from collections.abc import Callable
 
-from rse_pf.fair_queue import FairQueue
 from rse_pf.identity import RobotId
+from rse_pf.limits.fair_queue import FairQueue
 
 __all__ = ["JobSlots", "make_slot_file"]
 

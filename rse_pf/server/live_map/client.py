@@ -15,8 +15,6 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
-from rse_pf.lease import Lease
-from rse_pf.object_store import ObjectStore
 from rse_pf.server.live_map.connection_security import internal_key
 from rse_pf.server.live_map.lease import decode_lease, lease_name, tenant_folder
 from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection
@@ -27,6 +25,8 @@ from rse_pf.server.live_map.process_pool import (
     start_map_server,
 )
 from rse_pf.server.log import JsonLog
+from rse_pf.storage.lease import Lease
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.wire.live_map import LiveRequest
 
 __all__ = ["LiveMapClient"]

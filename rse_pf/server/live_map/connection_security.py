@@ -21,7 +21,7 @@ import msgspec
 
 from rse_pf.auth.certificates import issue_server_certificate, make_authority
 from rse_pf.errors import Conflict, NotFound, StoreError, Unauthorized
-from rse_pf.object_store import ObjectStore
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = [
     "INTERNAL_KEY",

@@ -1,8 +1,8 @@
 """Read and write the lease of a live map: which process is its map server, and where that process listens.
 
-The compare-and-swap and the clocks of a lease are in `rse_pf.lease`; here are the record of live maps, its
-name in the object store, and the rule by which a process claims a map, connects to its map server or waits.
-"""
+The compare-and-swap and the clocks of a lease are in `rse_pf.storage.lease`; here are the record of live
+maps, its name in the object store, and the rule by which a process claims a map, connects to its map server
+or waits."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from typing import Literal
 import msgspec
 
 from rse_pf.errors import BadRequest, StoreError
-from rse_pf.lease import Lease
-from rse_pf.object_store import ObjectStore, name_segment
+from rse_pf.identity import name_segment
+from rse_pf.storage.lease import Lease
+from rse_pf.storage.object_store import ObjectStore
 
 __all__ = [
     "LeaseAction",

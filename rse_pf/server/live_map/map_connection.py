@@ -27,9 +27,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import RobotId
-from rse_pf.ipc import FrameReader, encode_message
-from rse_pf.lease import Lease, read_record
-from rse_pf.object_store import ObjectStore
+from rse_pf.processes.ipc import FrameReader, encode_message
 from rse_pf.server.live_map.connection_security import (
     MAX_MESSAGE_BYTES,
     TOKEN_S,
@@ -50,6 +48,8 @@ from rse_pf.server.live_map.process_pool import (
     MapServerProcess,
 )
 from rse_pf.server.log import JsonLog
+from rse_pf.storage.lease import Lease, read_record
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
 
 __all__ = ["ConnectionContext", "MapConnection", "can_begin_map"]

@@ -28,10 +28,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import PlatformSettings
-from rse_pf.ipc import FrameReader
-from rse_pf.linux import cpu_seconds
+from rse_pf.processes.ipc import FrameReader
+from rse_pf.processes.linux import cpu_seconds
+from rse_pf.processes.start import Child, ChildPlan, start_child
 
 __all__ = ["DEFAULT_IMPLEMENTATION", "ClaimOrder", "MapServerPool", "MapServerProcess", "start_map_server"]
 

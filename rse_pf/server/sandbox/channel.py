@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.errors import RsePfError
-from rse_pf.ipc import FrameReader
+from rse_pf.processes.ipc import FrameReader
 from rse_pf.services.custom.output import OutputLines
 
 __all__ = ["IpcChannel"]

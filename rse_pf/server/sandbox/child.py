@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError, InternalError, LimitExceeded, RsePfError, message_of
-from rse_pf.ipc import encode_message, encode_reply, receive
-from rse_pf.linux import close_other_descriptors, die_with_parent
+from rse_pf.processes.ipc import encode_message, encode_reply, receive
+from rse_pf.processes.linux import close_other_descriptors, die_with_parent
 from rse_pf.server.sandbox import isolation
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.runtime import Runtime, open_runtime

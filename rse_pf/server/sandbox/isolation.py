@@ -14,7 +14,13 @@ import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
-from rse_pf.linux import PR_CAPBSET_DROP, PR_SET_DUMPABLE, PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, prctl
+from rse_pf.processes.linux import (
+    PR_CAPBSET_DROP,
+    PR_SET_DUMPABLE,
+    PR_SET_NO_NEW_PRIVS,
+    PR_SET_SECCOMP,
+    prctl,
+)
 from rse_pf.server.sandbox.seccomp import LANGUAGES, MACHINES, filter_program
 
 __all__ = [

@@ -18,8 +18,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, NotFound, RsePfError
 from rse_pf.identity import RobotId, state_name
-from rse_pf.ipc import encode_message
-from rse_pf.object_store import ObjectStore
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.ports import Log
 from rse_pf.server.sandbox.channel import IpcChannel
 from rse_pf.server.sandbox.circuit_breaker import Block
@@ -43,6 +42,7 @@ from rse_pf.server.sandbox.zygote_client import ZygoteClient
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.wire import Failure, Result
 
 __all__ = ["SandboxHost", "SandboxManager"]

@@ -26,9 +26,9 @@ from typing import Any, Literal
 
 from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
-from rse_pf.fair_queue import largest_holder
 from rse_pf.identity import RobotId
-from rse_pf.ipc import encode_message
+from rse_pf.limits.fair_queue import largest_holder
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.sandbox.circuit_breaker import CircuitBreaker
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.service import Kind

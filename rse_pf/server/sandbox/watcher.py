@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rse_pf.linux import page_table_bytes, proportional_bytes, resident_bytes
+from rse_pf.processes.linux import page_table_bytes, proportional_bytes, resident_bytes
 
 __all__ = ["MemoryWatcher"]
 

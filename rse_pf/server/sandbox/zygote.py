@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rse_pf.child.fork_server import ForkPlan, read_packet, serve_forks
 from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.processes.fork_server import ForkPlan, read_packet, serve_forks
 from rse_pf.server.sandbox import isolation
 from rse_pf.server.sandbox.cgroup import Cgroups, own_hierarchies
 from rse_pf.server.sandbox.child import SandboxPlan, readable_paths, run_sandbox

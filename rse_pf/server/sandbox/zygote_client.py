@@ -13,10 +13,10 @@ import tempfile
 from asyncio import AbstractEventLoop
 from collections.abc import Callable, Sequence
 
-from rse_pf.child.fork_server import read_packet, send_order, start_fork_server
-from rse_pf.child.start import ChildPlan
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.processes.fork_server import read_packet, send_order, start_fork_server
+from rse_pf.processes.start import ChildPlan
 from rse_pf.server.ports import Log
 from rse_pf.services.custom.installed import InstalledService
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from rse_pf.errors import Busy, Expired, RsePfError, Stale
-from rse_pf.fair_queue import FairQueue
 from rse_pf.identity import RobotId
+from rse_pf.limits.fair_queue import FairQueue
 from rse_pf.server.scheduling.overload import PAUSE_S, Overload, TurnTime, is_too_late
 from rse_pf.wire import Command
 

@@ -16,9 +16,9 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.config import ServingSettings
+from rse_pf.http.unauthenticated import SilentConnections
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.server.gateway.rate_limits import HANDSHAKE_BURST
-from rse_pf.silent_connections import SilentConnections
-from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["RobotAcceptor"]
 

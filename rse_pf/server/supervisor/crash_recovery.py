@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rse_pf.auth.trust_store import TrustStore
-from rse_pf.crash_record import BLOCK_S, WINDOW_S, CrashRecord
 from rse_pf.identity import RobotId
+from rse_pf.limits.crash_record import BLOCK_S, WINDOW_S, CrashRecord
 from rse_pf.server.gateway.audit_recorder import ServerAudit
 from rse_pf.server.ports import Log
 from rse_pf.server.supervisor.crash_report import CRASH_SIGNALS, CrashReport

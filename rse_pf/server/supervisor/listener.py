@@ -9,8 +9,8 @@ from collections.abc import Awaitable, Callable
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config import PlatformSettings, ServingSettings
 from rse_pf.config.placement import is_loopback
-from rse_pf.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.errors import ConfigurationError
+from rse_pf.http.control_port import ControlReply, ControlRequest, serve_control
 
 __all__ = ["bound_socket", "check_authentication", "open_control"]
 

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import msgspec
 
-from rse_pf.child.start import Child
 from rse_pf.config import PlatformSettings
-from rse_pf.recording.recorder_process import RecorderPlan, start_recorder
-from rse_pf.recording.redact import KEY_BYTES
+from rse_pf.extensions.recording.recorder_process import RecorderPlan, start_recorder
+from rse_pf.extensions.recording.redact import KEY_BYTES
+from rse_pf.processes.start import Child
 from rse_pf.wire import PROTOCOL_VERSION
 
 __all__ = ["ServerRecording", "server_version"]

@@ -26,16 +26,15 @@ from rse_pf.auth.trust_store import TrustStore
 from rse_pf.config import PlatformSettings
 from rse_pf.config.elasticity import MOVES_PER_S
 from rse_pf.config.placement import ServerPlacement
-from rse_pf.control_http import (
+from rse_pf.http.control_port import (
     ControlReply,
     ControlRequest,
     json_reply,
     number_of,
     refused_reply,
 )
-from rse_pf.event_loop import run_in_loop
-from rse_pf.files import replace_json
-from rse_pf.linux import cpu_seconds, disk_free_percent, raise_descriptor_limit, resident_bytes
+from rse_pf.processes.event_loop import run_in_loop
+from rse_pf.processes.linux import cpu_seconds, disk_free_percent, raise_descriptor_limit, resident_bytes
 from rse_pf.server.gateway.audit_recorder import ServerAudit
 from rse_pf.server.gateway.migration import plan
 from rse_pf.server.jobs.slots import make_slot_file
@@ -58,6 +57,7 @@ from rse_pf.server.supervisor.session_registry import SessionRegistry
 from rse_pf.server.supervisor.trust_poller import poll_trust
 from rse_pf.server.supervisor.worker import WorkerPlan
 from rse_pf.server.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerProcess, fork_workers
+from rse_pf.storage.files import replace_json
 
 __all__ = ["serve"]
 

@@ -28,12 +28,11 @@ from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings, ServiceSettings
 from rse_pf.errors import ConfigurationError, RsePfError, message_of
-from rse_pf.event_loop import event_loop_maker
+from rse_pf.extensions.recording.tap import RecordingTap, hand_pipe
 from rse_pf.identity import RobotId
-from rse_pf.ipc import receive_bytes
-from rse_pf.linux import die_with_parent, set_process_name
-from rse_pf.object_store import ObjectStore
-from rse_pf.recording.tap import RecordingTap, hand_pipe
+from rse_pf.processes.event_loop import event_loop_maker
+from rse_pf.processes.ipc import receive_bytes
+from rse_pf.processes.linux import die_with_parent, set_process_name
 from rse_pf.server.compute.lane import ComputeLane
 from rse_pf.server.compute.limited_services import LimitedServices, limited_processes
 from rse_pf.server.gateway.answers import Answers, EncodedAnswer
@@ -79,6 +78,7 @@ from rse_pf.server.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, packaged_services
 from rse_pf.services.loading import load_services
+from rse_pf.storage.object_store import ObjectStore
 from rse_pf.wire.server_session import CLOSE_RATE
 
 __all__ = ["BEGIN_LENGTH", "HANDOVER", "WorkerPlan", "repeat_for", "run_worker"]

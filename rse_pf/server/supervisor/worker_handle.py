@@ -23,7 +23,7 @@ import msgspec
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
-from rse_pf.event_loop import event_loop_maker
+from rse_pf.processes.event_loop import event_loop_maker
 from rse_pf.server.supervisor.orders import (
     BeginOrder,
     BlocksOrder,

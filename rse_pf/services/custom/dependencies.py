@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import CommandFailed, ConfigurationError, MissingExtra, UsageError
-from rse_pf.files import replace_file, replace_json
 from rse_pf.services.custom.regular_files import read_regular_file
+from rse_pf.storage.files import replace_file, replace_json
 
 __all__ = [
     "LOCK_FILE",

@@ -10,7 +10,7 @@ import codecs
 import time
 from collections.abc import Iterator
 
-from rse_pf.token_bucket import TokenBucket
+from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = ["MAX_LINE", "OutputLines", "format_output_line"]
 

@@ -24,7 +24,6 @@ import msgspec
 
 from rse_pf.config.resource_names import SERVICES_PREFIX
 from rse_pf.errors import ConfigurationError, Conflict, NotFound, StoreError, UsageError
-from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.services.custom.dependencies import SHA256_PATTERN, Dependencies, require_same_versions
 from rse_pf.services.custom.installed import (
     DEPENDENCIES_FOLDER,
@@ -34,6 +33,7 @@ from rse_pf.services.custom.installed import (
     read_dependencies,
 )
 from rse_pf.services.custom.regular_files import list_files, read_regular_file, require_regular_files
+from rse_pf.storage.object_store import ObjectStore, digest_of
 
 __all__ = [
     "CURRENT",

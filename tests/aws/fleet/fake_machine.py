@@ -12,7 +12,7 @@ from botocore.exceptions import ClientError
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 WALL_S = float(int(time.time()) // 60 * 60)
 """The wall clock of every machine at 120 s: the begin of this minute."""

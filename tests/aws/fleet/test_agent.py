@@ -19,8 +19,8 @@ from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, main
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
 from rse_pf.errors import RsePfError, StoreError
-from rse_pf.object_store import DirectoryStore, MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore
 
 KEYS = SigningKey.from_seed(b"k" * 32, "test-key").key_set().to_json().encode()
 PAGE = 'rse_pf_requests_total{{result="ok",service="pnp"}} {requests}\nrse_pf_robots {robots}\n'

@@ -16,7 +16,7 @@ from rse_pf.aws.fleet import agent
 from rse_pf.aws.fleet.agent import main
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.errors import Disconnected, StoreError
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 
 class _Port(BaseHTTPRequestHandler):

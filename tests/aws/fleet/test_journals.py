@@ -20,7 +20,7 @@ from rse_pf.aws.fleet.tasks.journals import JOURNAL_SHIP_S
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 BEGIN_US = 1_795_406_400_000_000
 

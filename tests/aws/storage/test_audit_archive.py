@@ -16,7 +16,7 @@ from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit, open_audit_ar
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, StoreError
-from rse_pf.object_store import MemoryStore, ObjectStore
+from rse_pf.storage.object_store import MemoryStore, ObjectStore
 
 INSTANCE = "i-0123456789abcdef0"
 SMALL = 2_000

@@ -17,7 +17,7 @@ from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage import S3Store, open_bucket
 from rse_pf.errors import StoreRefused
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import digest_of
+from rse_pf.storage.object_store import digest_of
 
 BUCKET = "objects"
 FAILING_SHARE = 0.3

@@ -21,7 +21,7 @@ from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
 from rse_pf.identity import RobotId
 from rse_pf.local.firewall import key_file, key_set_file
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 Capture = pytest.CaptureFixture[str]
 SETTINGS = AuthSettings()

@@ -17,7 +17,7 @@ from rse_pf.errors import UsageError
 from rse_pf.local.lan.listener import LanListener, authority_file
 from rse_pf.local.processes import mark_of
 from rse_pf.local.state import PlatformState
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 Capture = pytest.CaptureFixture[str]
 

@@ -21,7 +21,7 @@ from rse_pf.cli.main import main
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 from tests.cli.maps.test_from_camera import PLATFORM, SolvingRobot
 from tests.client_sdk.bags.small_bags import camera_info, raw_image, stamp_of, transforms
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at

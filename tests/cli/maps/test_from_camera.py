@@ -21,12 +21,12 @@ from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.point_map import read_ply
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
-from rse_pf.accounts import set_own_quota
 from rse_pf.cli.main import main
 from rse_pf.cli.maps import from_camera
 from rse_pf.cli.maps.frame_table import FrameTable
-from rse_pf.object_store import DirectoryStore
 from rse_pf.pnp import refine_with_depth, solve_pnp
+from rse_pf.storage.object_store import DirectoryStore
+from rse_pf.storage.quotas import set_own_quota
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")

@@ -14,7 +14,7 @@ from rse_pf.cli.main import main
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId
 from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
 OK = PhotoLocation(

@@ -12,7 +12,7 @@ from rse_pf.cli.main import main
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 
 def make(keyframes: int) -> bytes:

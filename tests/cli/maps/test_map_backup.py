@@ -15,11 +15,11 @@ from rse_pf.aws.storage import S3Store
 from rse_pf.cli.main import main
 from rse_pf.identity import RobotId
 from rse_pf.local.firewall import ensure_key
-from rse_pf.maps.charges import charge_name, sum_charges
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.maps.removal import choose_superseded
-from rse_pf.object_store import DirectoryStore, ObjectStore, digest_of
+from rse_pf.storage.charges import charge_name, sum_charges
+from rse_pf.storage.object_store import DirectoryStore, ObjectStore, digest_of
 
 Capture = pytest.CaptureFixture[str]
 ROBOT = RobotId("acme", "robot-1")

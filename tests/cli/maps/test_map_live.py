@@ -9,9 +9,9 @@ import pytest
 
 from rse_pf.cli.main import main
 from rse_pf.live_map.events import MapServerChanged, encode_events
-from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.lease import MapLease, lease_name, map_folder
 from rse_pf.server.live_map.map_server.log import LiveLog
+from rse_pf.storage.object_store import DirectoryStore
 
 
 @pytest.fixture

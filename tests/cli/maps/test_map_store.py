@@ -18,7 +18,7 @@ from rse_pf.local.processes import ProcessMark, mark_of
 from rse_pf.local.state import PlatformState, settings_file
 from rse_pf.maps.format import decode_map, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 from tests.cli.maps.test_bags import folder
 from tests.cli.maps.test_from_camera import PLATFORM
 from tests.cli.maps.test_from_camera import folder as video_folder

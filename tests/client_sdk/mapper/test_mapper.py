@@ -25,7 +25,7 @@ from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.errors import Busy, MissingExtra, UsageError
-from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.client_sdk.live.fake_live_map import solve

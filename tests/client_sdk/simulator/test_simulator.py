@@ -17,7 +17,7 @@ from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import pose_difference, transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 

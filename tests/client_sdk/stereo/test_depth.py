@@ -18,8 +18,8 @@ from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.compare.solvers import InProcessSolver
-from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
+from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Camera, inverse, transform
 from rse_pf.maps.format import decode_map
 from rse_pf.pnp import DepthNoise

@@ -13,7 +13,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference
 from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, covered, foreign, frame_at
 from tests.client_sdk.tracking.driving import NO_ANSWER, Answer, run, run_all, solve

@@ -14,7 +14,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.enrolment import Enrolment
 from rse_pf.errors import Conflict, UsageError
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 
 def encoded(points: int) -> bytes:

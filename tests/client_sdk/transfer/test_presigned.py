@@ -12,7 +12,7 @@ import pytest
 from fake_data_service import HttpServer, Service, small_settings
 
 from client_sdk.transfer.data_client import DataClient, DataOptions, is_allowed
-from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 DATA = random.Random(1).randbytes(700_000)
 DIGEST = digest_of(DATA)

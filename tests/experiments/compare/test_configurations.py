@@ -10,7 +10,7 @@ import pytest
 from client_sdk.frontend import FrontEndOptions
 from client_sdk.mapper import Mapper
 from rse_pf.errors import UsageError
-from rse_pf.experiments.compare.configurations import BUILT_IN, SLOTS, configurations_of
+from rse_pf.extensions.experiments.compare.configurations import BUILT_IN, SLOTS, configurations_of
 
 toml = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.compare import recordings
-from rse_pf.experiments.compare.recordings import drives_of
+from rse_pf.extensions.experiments.compare import recordings
+from rse_pf.extensions.experiments.compare.recordings import drives_of
 from tests.experiments.compare.recordings import flat_drive
 
 

@@ -13,14 +13,14 @@ import pytest
 
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.compare import evo_figures, run
-from rse_pf.experiments.compare.configurations import configurations_of
-from rse_pf.experiments.compare.evo_figures import evo_ate_cm, evo_command
-from rse_pf.experiments.compare.report import row_of, runs_line, table_lines
-from rse_pf.experiments.compare.run import CompareOptions, run_compare
-from rse_pf.experiments.compare.solvers import InProcessSolver
-from rse_pf.experiments.compare.tracking_run import track
-from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.extensions.experiments.compare import evo_figures, run
+from rse_pf.extensions.experiments.compare.configurations import configurations_of
+from rse_pf.extensions.experiments.compare.evo_figures import evo_ate_cm, evo_command
+from rse_pf.extensions.experiments.compare.report import row_of, runs_line, table_lines
+from rse_pf.extensions.experiments.compare.run import CompareOptions, run_compare
+from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
+from rse_pf.extensions.experiments.compare.tracking_run import track
+from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from tests.experiments.compare.recordings import black, flat_drive
 

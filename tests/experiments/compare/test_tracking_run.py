@@ -11,10 +11,10 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.compare.configurations import Configuration, configurations_of
-from rse_pf.experiments.compare.recordings import Drive
-from rse_pf.experiments.compare.solvers import InProcessSolver
-from rse_pf.experiments.compare.tracking_run import TrackingRun, longest_gap_s, track
+from rse_pf.extensions.experiments.compare.configurations import Configuration, configurations_of
+from rse_pf.extensions.experiments.compare.recordings import Drive
+from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
+from rse_pf.extensions.experiments.compare.tracking_run import TrackingRun, longest_gap_s, track
 from tests.client_sdk.mapper.test_imu import leaning_first, with_imu  # noqa: F401
 from tests.experiments.compare.recordings import black, flat_drive
 

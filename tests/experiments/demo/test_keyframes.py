@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from client_sdk.frontend import Frame, FrontEndOptions, TrackedFrame
-from rse_pf.experiments.demo.keyframes import KeyframeCollector
+from rse_pf.extensions.experiments.demo.keyframes import KeyframeCollector
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import decode_map, encode_map
 

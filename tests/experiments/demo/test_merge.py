@@ -12,7 +12,7 @@ import pytest
 from client_sdk.point_map import read_ply
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.demo.merge import MAP_FILE, MERGED_MAP, print_tenths, write_merged
+from rse_pf.extensions.experiments.demo.merge import MAP_FILE, MERGED_MAP, print_tenths, write_merged
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.services.mapping.merge import MergeReply, MergeRequest, merge_maps
 from tests.synthetic_maps import make_world

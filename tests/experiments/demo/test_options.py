@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from client_sdk.simulator import frames_to_overlap
-from rse_pf.experiments.demo.robot import DemoOptions
+from rse_pf.extensions.experiments.demo.robot import DemoOptions
 
 
 @pytest.mark.parametrize("robots", [1, 2, 3, 8])

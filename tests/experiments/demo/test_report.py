@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from client_sdk.trajectory import Trajectory
-from rse_pf.experiments.demo.report import advice, closing_lines, is_lost, make_report
-from rse_pf.experiments.demo.robot import RobotFinished, _is_metric
-from rse_pf.experiments.results.records import CommandRecord
+from rse_pf.extensions.experiments.demo.report import advice, closing_lines, is_lost, make_report
+from rse_pf.extensions.experiments.demo.robot import RobotFinished, _is_metric
+from rse_pf.extensions.experiments.results.records import CommandRecord
 
 COMMAND = CommandRecord(
     id=1, robot="robot-1", planned=0.0, sent=0.0, answered=0.01, server="a", code="ok",

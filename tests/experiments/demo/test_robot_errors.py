@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.experiments.child_process import ChildFailed
-from rse_pf.experiments.demo import robot
+from rse_pf.extensions.experiments.child_process import ChildFailed
+from rse_pf.extensions.experiments.demo import robot
 
 
 class Pipe:

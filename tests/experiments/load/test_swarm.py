@@ -11,12 +11,12 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.load.payloads import SolvedPayload, is_right, make_payloads
-from rse_pf.experiments.load.run import report_of, table_of
-from rse_pf.experiments.load.scenario import LoadScenario, read_scenario, write_scenario
-from rse_pf.experiments.load.swarm import SwarmResult, records_of
-from rse_pf.experiments.load.swarm_process import ResultRows, plan_s
-from rse_pf.experiments.results.records import CommandRecord
+from rse_pf.extensions.experiments.load.payloads import SolvedPayload, is_right, make_payloads
+from rse_pf.extensions.experiments.load.run import report_of, table_of
+from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario, write_scenario
+from rse_pf.extensions.experiments.load.swarm import SwarmResult, records_of
+from rse_pf.extensions.experiments.load.swarm_process import ResultRows, plan_s
+from rse_pf.extensions.experiments.results.records import CommandRecord
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from rse_pf.services.pnp import PnpReply, PnpRequest

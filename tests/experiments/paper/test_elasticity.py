@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.elasticity import (
+from rse_pf.extensions.experiments.paper.elasticity import (
     CpuCost,
     crashes,
     elasticity_figures,
     find_unjustified_scale_outs,
 )
-from rse_pf.experiments.results.records import Records
+from rse_pf.extensions.experiments.results.records import Records
 
 ASKED = {
     "time": 0.0, "action": "experiment", "kind": "elasticity", "min_servers": 2, "period_s": 2.0,

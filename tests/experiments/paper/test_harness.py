@@ -6,8 +6,8 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.harness import generator_of, policy_parameters
-from rse_pf.experiments.results.records import Records
+from rse_pf.extensions.experiments.paper.harness import generator_of, policy_parameters
+from rse_pf.extensions.experiments.results.records import Records
 
 
 def test_compression_shortens_periods_but_no_threshold():

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rse_pf.experiments.paper.latency import latency_figures
-from rse_pf.experiments.results.records import CommandRecord, Records
+from rse_pf.extensions.experiments.paper.latency import latency_figures
+from rse_pf.extensions.experiments.results.records import CommandRecord, Records
 
 ASKED = {"time": 0.0, "action": "experiment", "kind": "latency", "link_round_trip_ms": 130.0}
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.robustness import robustness_figures, robustness_page
-from rse_pf.experiments.results.records import CommandRecord, Records
+from rse_pf.extensions.experiments.paper.robustness import robustness_figures, robustness_page
+from rse_pf.extensions.experiments.results.records import CommandRecord, Records
 
 
 def event(time_s, action, **details):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli import experiment
-from rse_pf.experiments.paper.verify import read_report, report_folders, verify
-from rse_pf.experiments.results.rerun import rerun_arguments, rerun_figures
+from rse_pf.extensions.experiments.paper.verify import read_report, report_folders, verify
+from rse_pf.extensions.experiments.results.rerun import rerun_arguments, rerun_figures
 
 RESULTS = Path(__file__).resolve().parents[3] / "docs" / "results"
 FOLDERS = report_folders(RESULTS)

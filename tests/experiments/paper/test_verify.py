@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.verify import broken_invariants, figures_of, run_folders, verify
-from rse_pf.experiments.results.records import (
+from rse_pf.extensions.experiments.paper.verify import broken_invariants, figures_of, run_folders, verify
+from rse_pf.extensions.experiments.results.records import (
     CommandRecord,
     EventLog,
     SampleLog,
@@ -18,7 +18,7 @@ from rse_pf.experiments.results.records import (
     run_sample,
     write_commands,
 )
-from rse_pf.experiments.results.result_folder import write_json
+from rse_pf.extensions.experiments.results.result_folder import write_json
 from rse_pf.local.control.monitor import ServerSample
 
 ORIGIN_S = 1000.0

@@ -8,15 +8,15 @@ import sys
 import pytest
 
 from rse_pf.errors import MissingExtra
-from rse_pf.experiments.paper.latency import latency_figures
-from rse_pf.experiments.paper.robustness import robustness_figures
-from rse_pf.experiments.plots.figures import (
+from rse_pf.extensions.experiments.paper.latency import latency_figures
+from rse_pf.extensions.experiments.paper.robustness import robustness_figures
+from rse_pf.extensions.experiments.plots.figures import (
     draw_elasticity,
     draw_latency,
     draw_robustness,
     require_matplotlib,
 )
-from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
+from rse_pf.extensions.experiments.results.records import CommandRecord, Records, run_sample
 from rse_pf.local.control.monitor import ServerSample
 
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from client_sdk.trajectory import Trajectory
-from rse_pf.experiments.plots.map_image import COLOURS
-from rse_pf.experiments.plots.trajectory_image import _TRUTH, DrawnPath, Panel, draw_trajectories, pieces
+from rse_pf.extensions.experiments.plots.map_image import COLOURS
+from rse_pf.extensions.experiments.plots.trajectory_image import (
+    _TRUTH,
+    DrawnPath,
+    Panel,
+    draw_trajectories,
+    pieces,
+)
 
 image = pytest.importorskip("PIL.Image")
 

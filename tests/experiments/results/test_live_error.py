@@ -11,7 +11,7 @@ import pytest
 
 from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.live_error import (
+from rse_pf.extensions.experiments.results.live_error import (
     LIVE_RECORDS,
     TRUTH,
     final_trajectory,

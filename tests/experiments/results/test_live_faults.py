@@ -12,17 +12,17 @@ import pytest
 
 from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.live_error import LIVE_RECORDS, TRUTH
-from rse_pf.experiments.results.live_faults import fault_rows, live_fault_figures
-from rse_pf.experiments.results.log_replay import read_log
-from rse_pf.experiments.results.records import CommandRecord, Records
+from rse_pf.extensions.experiments.results.live_error import LIVE_RECORDS, TRUTH
+from rse_pf.extensions.experiments.results.live_faults import fault_rows, live_fault_figures
+from rse_pf.extensions.experiments.results.log_replay import read_log
+from rse_pf.extensions.experiments.results.records import CommandRecord, Records
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.live_map.events import KeyframeAdded, MapServerChanged, encode_events
-from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.lease import map_folder
 from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
+from rse_pf.storage.object_store import DirectoryStore
 
 NUMBERS = range(4)
 FAULT_S, RELEASED_S, SERVING_S = 12.0, 12.5, 14.25

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from client_sdk.trajectory import Trajectory
-from rse_pf.experiments.results.map_error import (
+from rse_pf.extensions.experiments.results.map_error import (
     JoinedRobot,
     joined_robots,
     merge_section,

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.records import (
+from rse_pf.extensions.experiments.results.records import (
     CommandRecord,
     EventLog,
     SampleLog,

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures, rerun_plan
+from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures, rerun_plan
 
 WIFI = "wifi/first_answer_after_heal_s/p99"
 

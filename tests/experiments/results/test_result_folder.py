@@ -11,10 +11,15 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.demo.run import DemoOptions, run_demo
-from rse_pf.experiments.load.run import run_swarm
-from rse_pf.experiments.load.scenario import LoadScenario
-from rse_pf.experiments.results.result_folder import RUN_FILES, commit_of, finish_report, fresh_folder
+from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
+from rse_pf.extensions.experiments.load.run import run_swarm
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.results.result_folder import (
+    RUN_FILES,
+    commit_of,
+    finish_report,
+    fresh_folder,
+)
 
 
 def test_all_results_of_an_earlier_run_are_removed(tmp_path):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.results.records import CommandRecord
-from rse_pf.experiments.results.summary import (
+from rse_pf.extensions.experiments.results.records import CommandRecord
+from rse_pf.extensions.experiments.results.summary import (
     longest_outages,
     outage_figures,
     summarise,

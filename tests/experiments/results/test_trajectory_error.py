@@ -9,7 +9,7 @@ import pytest
 
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import (
+from rse_pf.extensions.experiments.results.trajectory_error import (
     accuracy,
     align,
     match_truth,

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.custom.installed import install
 from rse_pf.services.pnp import make_request
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 from rse_pf.wire import Command, Ping, Pong, Progress, Result
 from tests.hostile.attacks import AttackTarget, Socket
 

@@ -7,7 +7,7 @@ import hashlib
 import pytest
 from fake_data_service import Service, small_settings
 
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
 ROBOTS = 50
 

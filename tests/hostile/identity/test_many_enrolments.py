@@ -16,7 +16,7 @@ from rse_pf.auth.tokens import KeySet, SigningKey, verify_token
 from rse_pf.auth.trust_store import AccessControlStore, TrustStore, key_set_from_snapshot
 from rse_pf.config import AuthSettings
 from rse_pf.errors import UsageError
-from rse_pf.object_store import DirectoryStore, MemoryStore
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore
 
 PLATFORM = SigningKey.from_seed(b"p" * 32, "p1")
 HONEST = SigningKey.of_robot(b"h" * 32)

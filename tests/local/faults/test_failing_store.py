@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 from rse_pf.local.faults.failing_store import failing_environment, set_failing_percent
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 PROGRAM = """
 import sys
 from pathlib import Path
 from rse_pf.errors import StoreError
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 store, failed = DirectoryStore(Path(sys.argv[1])), 0
 for number in range(200):
     try:

@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.recording import file_format
+from rse_pf.extensions.recording.writer import RecordingWriter
 from rse_pf.pnp.problems import PnpProblem, make_problem
-from rse_pf.recording import file_format
-from rse_pf.recording.writer import RecordingWriter
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import make_request

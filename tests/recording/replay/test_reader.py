@@ -13,9 +13,9 @@ from mcap.writer import CompressionType, Writer
 from recording.replay.made import START_NS, Made, jpeg
 
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
-from rse_pf.recording import file_format, reader
-from rse_pf.recording.reader import open_recording
-from rse_pf.recording.summary import Wanted
+from rse_pf.extensions.recording import file_format, reader
+from rse_pf.extensions.recording.reader import open_recording
+from rse_pf.extensions.recording.summary import Wanted
 from rse_pf.wire import Command, Failure, Result
 
 

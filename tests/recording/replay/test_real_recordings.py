@@ -14,10 +14,10 @@ from guarded_server import GuardedServer
 from client_sdk import connect
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
+from rse_pf.extensions.recording.reader import open_recording
+from rse_pf.extensions.recording.replay import run
+from rse_pf.extensions.recording.replay.limited import LimitedReplay
 from rse_pf.pnp.problems import DEGENERATE, make_degenerate, make_problem
-from rse_pf.recording.reader import open_recording
-from rse_pf.recording.replay import run
-from rse_pf.recording.replay.limited import LimitedReplay
 from rse_pf.wire import CODECS
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]

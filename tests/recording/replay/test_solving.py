@@ -13,11 +13,11 @@ from recording.replay.made import START_NS, Made
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest
+from rse_pf.extensions.recording.reader import RecordedCommand, open_recording
+from rse_pf.extensions.recording.replay import run
+from rse_pf.extensions.recording.replay.solving import TIMES_AND_PLACES, Overrides, Resolver, pnp_reply
 from rse_pf.geometry import exp_se3, transform
 from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
-from rse_pf.recording.reader import RecordedCommand, open_recording
-from rse_pf.recording.replay import run
-from rse_pf.recording.replay.solving import TIMES_AND_PLACES, Overrides, Resolver, pnp_reply
 from rse_pf.wire import Failure, Result, make_codec
 
 SETTINGS = PlatformSettings()

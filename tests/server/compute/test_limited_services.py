@@ -9,9 +9,9 @@ import msgspec
 import pytest
 from server.gateway.worker_parts import WorkerParts, worker_parts
 
-from rse_pf.child.limited import Overran
 from rse_pf.errors import Busy, WorkerLost
 from rse_pf.identity import RobotId
+from rse_pf.processes.limited import Overran
 from rse_pf.server.compute.limited_services import LimitedServices
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.wire import Command, Failure, Result

@@ -14,9 +14,9 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import LimitExceeded, MissingExtra
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import digest_of, open_store
 from rse_pf.server.compute.process import configuration_of, decode_reply, encode_request, make_handler
 from rse_pf.service import Registry
+from rse_pf.storage.object_store import digest_of, open_store
 from rse_pf.wire import Command, Failure, Result
 
 ALICE, BOB = RobotId("default", "alice"), RobotId("default", "bob")

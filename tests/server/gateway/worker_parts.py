@@ -11,10 +11,9 @@ from typing import Any
 from fakes import FakeLoop, FakeWire
 
 from rse_pf.auth.tokens import Claims, KeySet
-from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
-from rse_pf.object_store import MemoryStore
+from rse_pf.processes.limited import LimitedProcesses
 from rse_pf.server.compute.lane import ComputeLane
 from rse_pf.server.compute.limited_services import LimitedServices
 from rse_pf.server.gateway.answers import Answers, EncodedAnswer
@@ -30,6 +29,7 @@ from rse_pf.server.ports import Clocks, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue
 from rse_pf.service import Registry
 from rse_pf.services import echo
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import SUBPROTOCOLS, Codec, Hello, make_codec
 
 BINARY = 2

@@ -7,8 +7,8 @@ import pytest
 
 from rse_pf.errors import BadRequest, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, job_key, record_name, verdict_on
+from rse_pf.storage.object_store import MemoryStore
 
 NAME = record_name(RobotId("default", "robot-1"), "ab" * 32)
 LEASE_S = 5.0

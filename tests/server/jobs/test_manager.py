@@ -17,14 +17,14 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
-from rse_pf.ipc import encode_message
-from rse_pf.object_store import MemoryStore
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.jobs.lease import JobRecord
 from rse_pf.server.jobs.manager import JobManager
 from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.runner import JobContext
 from rse_pf.server.jobs.slots import JobSlots, make_slot_file
 from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
 from tests.fakes import FakeLog, FakeLoop
 

@@ -6,9 +6,9 @@ import msgspec
 import pytest
 
 from rse_pf.errors import StoreError
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.jobs.lease import JobLease, JobRecord, decode_record, verdict_on
 from rse_pf.server.jobs.record_gc import RecordCollector
+from rse_pf.storage.object_store import MemoryStore
 
 LIFE_S, LEASE_S = 1000.0, 5.0
 NAME = "jobs/default/robot-1/" + "ab" * 32

@@ -16,13 +16,13 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.identity import RobotId, object_name
-from rse_pf.ipc import encode_message
-from rse_pf.linux import raise_descriptor_limit
-from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.processes.ipc import encode_message
+from rse_pf.processes.linux import raise_descriptor_limit
 from rse_pf.server.jobs.lease import JobLease, JobRecord, record_name
 from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.server.jobs.slots import JobSlots, make_slot_file
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 SETTINGS = PlatformSettings.from_dict(
     {

@@ -10,13 +10,10 @@ from typing import Any, TypeVar
 import msgspec
 from fakes import FakeLog
 
-from rse_pf.accounts import TenantAccount
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.lease import read_record
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import MemoryStore, ObjectStore
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, lease_name, map_folder
 from rse_pf.server.live_map.map_server.environment import MapImplementation, MapServerEnvironment, Urgency
 from rse_pf.server.live_map.map_server.keyframe_objects import KeyframeObjects
@@ -24,6 +21,9 @@ from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.server.live_map.map_server.map_server import MapServer
 from rse_pf.server.live_map.map_server.measurement import optimise_in_process
 from rse_pf.server.live_map.map_server.state import MapState, take_over
+from rse_pf.storage.lease import read_record
+from rse_pf.storage.object_store import MemoryStore, ObjectStore
+from rse_pf.storage.quotas import TenantAccount
 from tests.server.live_map.fake_map import FAKE_MAP
 
 __all__ = [

@@ -14,12 +14,12 @@ from fakes import FakeLog
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
-from rse_pf.ipc import encode_message
-from rse_pf.object_store import MemoryStore
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.live_map.connection_security import server_context
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, lease_name
 from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection, can_begin_map
 from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerPool, MapServerProcess
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
 from tests.server.live_map.fake_map import keyframe_request
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.ipc import encode_message
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.live_map.process_pool import MapServerPool, MapServerProcess
 
 

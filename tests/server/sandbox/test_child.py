@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.ipc import encode_message, receive
+from rse_pf.processes.ipc import encode_message, receive
 from rse_pf.server.sandbox import isolation
 from rse_pf.server.sandbox.child import readable_paths
 from rse_pf.services.custom.cpp import INCLUDE_FOLDER

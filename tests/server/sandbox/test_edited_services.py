@@ -18,13 +18,13 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.dependencies import Dependencies, platform_tag, tree_digest
 from rse_pf.services.custom.installed import InstalledService, install, installed_services
 from rse_pf.services.custom.verified_copy import PrivateFolder
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
 
 pytestmark = pytest.mark.system

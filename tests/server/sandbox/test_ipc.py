@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import BadMessage, LimitExceeded
-from rse_pf.ipc import FrameReader, encode_message, encode_reply, receive
+from rse_pf.processes.ipc import FrameReader, encode_message, encode_reply, receive
 from rse_pf.server.sandbox.channel import IpcChannel
 from tests.fakes import FakeLoop
 

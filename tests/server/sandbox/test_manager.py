@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.ipc import encode_message
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.sandbox.dry_run import DryRun, dry_run
 from rse_pf.services.custom.installed import read_service
 

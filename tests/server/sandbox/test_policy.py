@@ -8,7 +8,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.ipc import encode_message
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.sandbox.circuit_breaker import POISON_CRASHES, CircuitBreaker
 from rse_pf.server.sandbox.policy import (
     START_TIMEOUT_S,

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.child.fork_server import read_packet, send_order, start_fork_server
-from rse_pf.child.start import ChildPlan
+from rse_pf.processes.fork_server import read_packet, send_order, start_fork_server
+from rse_pf.processes.start import ChildPlan
 
 pytestmark = pytest.mark.system
 WAIT_S = 20.0

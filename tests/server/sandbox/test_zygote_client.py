@@ -16,7 +16,7 @@ from fakes import FakeLog
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.ipc import receive
+from rse_pf.processes.ipc import receive
 from rse_pf.server.sandbox.zygote_client import ZygoteClient
 
 pytestmark = pytest.mark.system

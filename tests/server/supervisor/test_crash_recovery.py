@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.crash_record import BLOCK_S, WINDOW_S
 from rse_pf.identity import RobotId
+from rse_pf.limits.crash_record import BLOCK_S, WINDOW_S
 from rse_pf.server.supervisor.crash_recovery import CrashRecovery
 from rse_pf.server.supervisor.crash_report import Crash
 from rse_pf.server.supervisor.orders import BanOrder

@@ -14,7 +14,6 @@ import msgspec
 import pytest
 
 from rse_pf.errors import ConfigurationError, StoreError, UsageError
-from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.services.custom.dependencies import Dependencies, tree_digest
 from rse_pf.services.custom.installed import InstalledService, install, installed_services
 from rse_pf.services.custom.publishing import (
@@ -32,6 +31,7 @@ from rse_pf.services.custom.publishing import (
     unpack_archive,
     unpublish,
 )
+from rse_pf.storage.object_store import MemoryStore, digest_of
 
 
 class Author:

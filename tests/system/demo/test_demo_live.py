@@ -15,10 +15,10 @@ import pytest
 
 from rse_pf.cli.main import main
 from rse_pf.errors import NotFound
-from rse_pf.experiments.results.live_error import live_figures, read_live_drives, read_live_map
+from rse_pf.extensions.experiments.results.live_error import live_figures, read_live_drives, read_live_map
 from rse_pf.identity import DEFAULT_TENANT
-from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.lease import decode_lease, lease_name
+from rse_pf.storage.object_store import DirectoryStore
 from tests.system.demo.test_demo import demo, finish, pids_of, read_until
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]

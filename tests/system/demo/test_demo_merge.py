@@ -13,7 +13,7 @@ import pytest
 from client_sdk.point_map import read_ply
 from client_sdk.trajectory import read_trajectory
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 pytestmark = pytest.mark.system
 

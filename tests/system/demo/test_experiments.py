@@ -7,7 +7,7 @@ import json
 import pytest
 
 from rse_pf.cli.main import main
-from rse_pf.experiments.paper.verify import verify
+from rse_pf.extensions.experiments.paper.verify import verify
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 

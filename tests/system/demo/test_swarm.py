@@ -19,9 +19,9 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.load.scenario import LoadScenario
-from rse_pf.experiments.load.swarm import Swarm
-from rse_pf.experiments.results.summary import summarise
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.swarm import Swarm
+from rse_pf.extensions.experiments.results.summary import summarise
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.processes import wait_ended
 

@@ -20,7 +20,7 @@ from rse_pf.aws.canary.handler import ask_known_pose
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError
 from rse_pf.local.control.platform import LocalPlatform
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 from tests.system.local.test_control_plane import News, platform
 
 pytestmark = pytest.mark.system

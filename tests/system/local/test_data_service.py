@@ -22,7 +22,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreFull
 from rse_pf.identity import RobotId, object_name
 from rse_pf.local.servers.single_servers import local_data_server
-from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 
 pytestmark = pytest.mark.system
 

@@ -22,8 +22,8 @@ from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.firewall import ensure_key
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import DirectoryStore
 from rse_pf.slam.keyframe_points import ObjectReference
+from rse_pf.storage.object_store import DirectoryStore
 from tests.server.live_map.map_server.test_keyframe_objects import keyframe_request, some_points
 from tests.server.live_map.map_server_bench import MAP
 

@@ -25,7 +25,7 @@ from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.control.status import data_url, platform_status, status_table
 from rse_pf.local.faults import faults
 from rse_pf.local.state import read_state
-from rse_pf.object_store import DirectoryStore
+from rse_pf.storage.object_store import DirectoryStore
 
 pytestmark = pytest.mark.system
 

@@ -15,8 +15,8 @@ import pytest
 from system.local.test_control_plane import SETTINGS, SOON_S, News, platform
 
 from client_sdk import connect
-from rse_pf.fleet_page.feeds.live_feed import LiveFeed
-from rse_pf.fleet_page.hub import Hub
+from rse_pf.extensions.fleet_page.feeds.live_feed import LiveFeed
+from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.local.firewall import key_file, read_key
 from tests.server.live_map.fake_map import keyframe_bytes
 

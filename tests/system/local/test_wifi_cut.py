@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.scenario import LoadScenario
-from rse_pf.experiments.load.swarm import Swarm
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.swarm import Swarm
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
 

@@ -13,8 +13,8 @@ import pytest
 
 import client_sdk
 from rse_pf.errors import Busy, Crashed, Expired
-from rse_pf.linux import cpu_seconds, resident_bytes
 from rse_pf.pnp.problems import make_problem
+from rse_pf.processes.linux import cpu_seconds, resident_bytes
 
 pytestmark = pytest.mark.system
 

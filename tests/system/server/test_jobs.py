@@ -13,7 +13,7 @@ import pytest
 
 import client_sdk
 from rse_pf.errors import Busy, Cancelled, Crashed, Expired
-from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 from rse_pf.wire import Command
 
 pytestmark = pytest.mark.system

@@ -27,8 +27,7 @@ from server.live_map.test_served import keyframe
 import client_sdk
 from rse_pf.config import PlatformSettings
 from rse_pf.config.settings import LIVE_PORTS
-from rse_pf.ipc import FrameReader, encode_message
-from rse_pf.object_store import DirectoryStore
+from rse_pf.processes.ipc import FrameReader, encode_message
 from rse_pf.server.live_map.connection_security import (
     TOKEN_S,
     ConnectionClaims,
@@ -37,6 +36,7 @@ from rse_pf.server.live_map.connection_security import (
     make_token,
 )
 from rse_pf.server.live_map.lease import LeaseRecord, decode_lease, lease_name
+from rse_pf.storage.object_store import DirectoryStore
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

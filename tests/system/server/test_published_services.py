@@ -14,9 +14,9 @@ from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.config import PlatformSettings
-from rse_pf.object_store import DirectoryStore
 from rse_pf.services.custom.installed import install
 from rse_pf.services.custom.publishing import publish
+from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.wire import Failure, Result
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]

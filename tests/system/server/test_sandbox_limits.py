@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.linux import cpu_seconds
+from rse_pf.processes.linux import cpu_seconds
 from rse_pf.services.custom.installed import install
 from rse_pf.wire import Failure, Result
 

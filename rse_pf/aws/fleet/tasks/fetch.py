@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rse_pf.aws.fleet.task import AgentContext
 from rse_pf.errors import NotFound
-from rse_pf.files import replace_file
+from rse_pf.storage.files import replace_file
 
 __all__ = ["fetch"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from rse_pf.aws.fleet.journal import make_batch
 from rse_pf.aws.fleet.task import AgentContext, Task
 from rse_pf.config.resource_names import JOURNAL_PREFIX
-from rse_pf.files import replace_file
+from rse_pf.storage.files import replace_file
 
 __all__ = ["JOURNAL_SHIP_S", "piece_name", "task"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rse_pf.auth.tokens import KeySet
 from rse_pf.aws.fleet.task import AgentContext, Task
 from rse_pf.aws.fleet.tasks.fetch import fetch
-from rse_pf.files import replace_file
+from rse_pf.storage.files import replace_file
 
 __all__ = ["task"]
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from queue import PriorityQueue
 from typing import Any, TypeVar
 
-from rse_pf.accounts import TenantAccount
 from rse_pf.config import LiveSettings
 from rse_pf.geometry import Array
 from rse_pf.live_map.events import MapStarted
@@ -25,6 +24,7 @@ from rse_pf.server.live_map.map_server.keyframe_objects import KeyframeObjects
 from rse_pf.server.log import JsonLog
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
+from rse_pf.storage.quotas import TenantAccount
 
 __all__ = [
     "FIRST_RETRY_S",

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rse_pf.accounts import TenantAccount
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.geometry import Array, transform
 from rse_pf.live_map.versions import PointSource
-from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.keyframe_points import MAX_POINTS_BYTES, decode_points
 from rse_pf.slam.ply import Colours, Points
+from rse_pf.storage.object_store import ObjectStore, digest_of
+from rse_pf.storage.quotas import TenantAccount
 
 __all__ = ["KeyframeObjects", "PointCloud"]
 

@@ -27,12 +27,12 @@ import msgspec
 from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError, StoreFull
 from rse_pf.live_map.events import Event, KeyframeAdded, encode_events
 from rse_pf.live_map.outcomes import Outcome
-from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.server.live_map.map_server.environment import (
     FIRST_RETRY_S,
     MapServerEnvironment,
     next_retry_s,
 )
+from rse_pf.storage.object_store import ObjectStore, digest_of
 
 __all__ = [
     "BUSY_RETRY_MS",

@@ -323,7 +323,7 @@ class MapServer:
         The bytes that were logged since the last snapshot must be free in the quota as well, without being
         charged: the next snapshot stores their features a second time before log entries are deleted.  If the
         store fails in another way than by StoreFull, nothing is charged: the entry waits for the store, and
-        `rse_pf.accounts` counts it later.
+        `rse_pf.storage.quotas` counts it later.
 
         Raises:
             QuotaExceeded: The tenant would store more than its quota.

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.child.start import ChildPlan, how_ended, start_child
 from rse_pf.errors import Crashed
 from rse_pf.geometry import Array
-from rse_pf.ipc import encode_message, receive
 from rse_pf.live_map.events import Event
 from rse_pf.live_map.measure import merge_measurements
+from rse_pf.processes.ipc import encode_message, receive
+from rse_pf.processes.start import ChildPlan, how_ended, start_child
 from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
 from rse_pf.server.live_map.map_server.state import MapState
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph

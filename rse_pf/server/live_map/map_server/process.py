@@ -1,6 +1,6 @@
 """Run the process of a map server, which a worker starts: claim one live map, serve it, exit.
 
-The process talks with its worker over a socket (`rse_pf.ipc`):
+The process talks with its worker over a socket (`rse_pf.processes.ipc`):
 
 1. The worker sends the settings and the implementation of the map (`start_map_server`).
 2. The process imports everything, opens the store and sends ``ready``.  A worker starts it before a map
@@ -33,14 +33,12 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rse_pf.accounts import TenantAccount
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import live_ports
 from rse_pf.errors import StoreError
-from rse_pf.ipc import FrameReader, encode_message, receive
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import ObjectStore
+from rse_pf.processes.ipc import FrameReader, encode_message, receive
 from rse_pf.server.live_map.connection_security import (
     ConnectionClaims,
     check_token,
@@ -62,6 +60,8 @@ from rse_pf.server.live_map.map_server.state import MapState, take_over
 from rse_pf.server.live_map.map_server.worker_connections import WorkerConnections, listen
 from rse_pf.server.live_map.process_pool import ClaimOrder
 from rse_pf.server.log import JsonLog
+from rse_pf.storage.object_store import ObjectStore
+from rse_pf.storage.quotas import TenantAccount
 
 __all__ = ["advertised_address", "run"]
 

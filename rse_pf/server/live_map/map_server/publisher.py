@@ -26,9 +26,9 @@ from rse_pf.live_map.versions import PointSource, as_internal_error
 from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import choose_superseded
-from rse_pf.object_store import digest_of
 from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
 from rse_pf.server.live_map.map_server.state import MapState
+from rse_pf.storage.object_store import digest_of
 from rse_pf.wire.live_map import LiveStart
 
 __all__ = ["NOTE_ALL_LEFT", "NOTE_CHANGED", "NOTE_UNUSED", "Publisher", "read_start_version"]

@@ -1,6 +1,6 @@
 """Serve the connections of workers to a map server: requests, replies and updates over TLS.
 
-A message is a MessagePack list with its length in front (`rse_pf.ipc`):
+A message is a MessagePack list with its length in front (`rse_pf.processes.ipc`):
 
 1. The worker sends ``hello`` with a token within `FIRST_REQUEST_S` seconds, else its connection is closed.
 2. The map server answers ``welcome``, or ``refused`` and closes the connection.
@@ -22,11 +22,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.errors import InternalError, RsePfError
+from rse_pf.http.unauthenticated import BACKLOG, FIRST_REQUEST_S, TlsListener
 from rse_pf.identity import RobotId
-from rse_pf.ipc import FrameReader, encode_message
+from rse_pf.processes.ipc import FrameReader, encode_message
 from rse_pf.server.live_map.connection_security import MAX_MESSAGE_BYTES
 from rse_pf.server.live_map.map_server.map_server import MapMoving, MapServer
-from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, TlsListener
 
 __all__ = ["WorkerConnections", "listen"]
 

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.http.unauthenticated import PendingHandshakes
 from rse_pf.identity import RobotId
+from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.server.gateway.rate_limits import CUT_OFF, RobotRates, SourceRates
-from rse_pf.silent_connections import PendingHandshakes
-from rse_pf.token_bucket import TokenBucket
 
 ROBOT = RobotId("default", "r")
 LIMITS = SessionSettings(max_commands_per_s=20.0)

@@ -16,12 +16,12 @@ from rse_pf.identity import RobotId, object_name
 from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import UP_FIELD, encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.live_map.map_server.environment import LIVE_MAP
 from rse_pf.server.live_map.map_server.keyframe_objects import KeyframeObjects
 from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest
 from tests.server.live_map.map_server_bench import MAP, Bench, settle
 

@@ -9,9 +9,7 @@ import msgspec
 import pytest
 
 from rse_pf.errors import BadRequest, StoreError, Unauthorized
-from rse_pf.lease import Lease, read_record
 from rse_pf.live_map.events import MapServerChanged, encode_events
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.live_map.connection_security import (
     TOKEN_S,
     ConnectionClaims,
@@ -22,6 +20,8 @@ from rse_pf.server.live_map.connection_security import (
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, map_folder, next_action
 from rse_pf.server.live_map.map_server.log import LeaseLost, LiveLog, MapSnapshot, entries_between_snapshots
 from rse_pf.server.live_map.map_server.state import MapState, restore
+from rse_pf.storage.lease import Lease, read_record
+from rse_pf.storage.object_store import MemoryStore
 from tests.server.live_map.fake_map import FAKE_MAP, FakeMap
 from tests.server.live_map.map_server_bench import FOLDER, LEASE, HandClock
 

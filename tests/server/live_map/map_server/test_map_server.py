@@ -13,11 +13,11 @@ from rse_pf.identity import RobotId
 from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, decode_events
 from rse_pf.live_map.outcomes import Joined, Outcome, Unaligned
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import MemoryStore
 from rse_pf.server.live_map.lease import next_action
 from rse_pf.server.live_map.map_server.environment import MapImplementation
 from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.server.live_map.map_server.map_server import MapMoving
+from rse_pf.storage.object_store import MemoryStore
 from tests.server.live_map.fake_map import FAKE_MAP, FakeMap
 from tests.server.live_map.map_server_bench import (
     FOLDER,

@@ -25,7 +25,6 @@ from rse_pf.errors import Conflict, NotFound, RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import KeyframeAdded, decode_events, encode_events
 from rse_pf.live_map.live_map import LiveMap
-from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.lease import MapLease, decode_lease, lease_name, map_folder
 from rse_pf.server.live_map.map_server.log import LiveLog
@@ -37,6 +36,7 @@ from rse_pf.server.live_map.process_pool import (
     start_map_server,
 )
 from rse_pf.server.log import JsonLog
+from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.wire.live_map import LiveMapRequest, LiveRequest
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.server.live_map.fake_map import FAKE_MAP, keyframe_request

@@ -8,7 +8,7 @@ import pytest
 
 from rse_pf.errors import Busy, NotFound, StoreError, StoreFull
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 from tests.server.live_map.map_server_bench import MAP, Bench, settle
 
 

@@ -10,7 +10,7 @@ import pytest
 from rse_pf.errors import Conflict, QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import MemoryStore, ObjectStore, charge_of
+from rse_pf.storage.object_store import MemoryStore, ObjectStore, charge_of
 from tests.server.live_map.map_server_bench import FOLDER, MAP, Bench, RunningMapServer, settle
 
 OTHER = RobotId("default", "robot-2", "thumb")

@@ -1,4 +1,0 @@
-"""Compare configurations of the tracker on recordings: ``rse-pf compare``.
-
-What tracks belongs to `client_sdk`; the formulas of the errors belong to `rse_pf.experiments.results`.
-"""

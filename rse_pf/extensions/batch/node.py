@@ -1,0 +1,129 @@
+"""One process of a cluster of Dask: a scheduler, or a worker that computes one part at a time.
+
+The order comes through the socket of the child, because it has the key of the cluster; a scheduler answers
+with its address.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
+pickled, so that anybody who may connect may run any code.  Each listens at one port, on one address.  A
+robot's bytes are never among it: a part names objects of the store, and its result is an object of the store.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import socket
+import sys
+import tempfile
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+
+from rse_pf.aws.storage import open_data_store
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError, message_of
+from rse_pf.extensions.batch.listening import bound_handshakes, without_pages
+from rse_pf.extensions.batch.parts import decode_part
+from rse_pf.extensions.batch.tasks import compute_part
+from rse_pf.processes.ipc import encode_message, receive
+from rse_pf.storage.object_store import ObjectStore
+from rse_pf.terminal import show
+
+__all__ = ["NodeOrder", "compute", "run_scheduler", "run_worker", "security_of"]
+
+_HOST = "127.0.0.1"
+"""Where scheduler and workers of one command listen: only processes of this machine reach them."""
+_DEATH_TIMEOUT_S = 20.0
+"""A worker that finds no scheduler ends after this."""
+
+
+class NodeOrder(msgspec.Struct, frozen=True, kw_only=True):
+    """What a process of a cluster is told: the cluster's key and certificate (PEM), and where to connect."""
+
+    certificate: str
+    key: str
+    address: str = ""
+    """Of the scheduler that a worker joins."""
+
+
+def security_of(certificate: str, key: str) -> Any:
+    """Return Dask's TLS for a cluster with one certificate, which everybody shows and nobody else has."""
+    from distributed.security import Security
+
+    return Security(
+        require_encryption=True, tls_ca_file=certificate, tls_client_key=key, tls_client_cert=certificate,
+        tls_scheduler_key=key, tls_scheduler_cert=certificate, tls_worker_key=key,
+        tls_worker_cert=certificate,
+    )  # fmt: skip
+
+
+def compute(settings: bytes, part: bytes) -> list[str]:
+    """Compute a part on a worker; return an empty list, or code, message and hint of what failed.
+
+    Args:
+        settings: The platform's settings as JSON; ``data.store`` has the parts.
+        part: As `encode_part` returned it.
+    """
+    try:
+        compute_part(_store_of(settings), decode_part(part))
+    except RsePfError as error:
+        return [error.code, error.message, error.hint]
+    except MemoryError:
+        return ["crashed", "a part needs more memory than its worker has", "merge fewer maps at once"]
+    except Exception as error:  # noqa: BLE001  a defect is reported where the command runs
+        return ["internal", f"a part failed: {message_of(error)[:200]}", "report it with the maps' sizes"]
+    return []
+
+
+def run_scheduler(parent: socket.socket) -> None:
+    """Schedule until the parent is gone."""
+    _run(parent, functools.partial(_scheduler, parent))
+
+
+def run_worker(parent: socket.socket) -> None:
+    """Compute parts until the parent or the scheduler is gone."""
+    _run(parent, _worker)
+
+
+def _run(parent: socket.socket, act: Callable[[NodeOrder], Awaitable[None]]) -> None:
+    order = receive(parent)
+    if order is None:
+        return
+
+    async def run() -> None:
+        await act(msgspec.convert(order, NodeOrder))
+
+    try:
+        asyncio.run(run())
+    except (OSError, asyncio.TimeoutError) as error:
+        show(message_of(error)[:200], error=True)
+        sys.exit(1)
+
+
+async def _scheduler(parent: socket.socket, order: NodeOrder) -> None:
+    from distributed import Scheduler
+
+    security = security_of(order.certificate, order.key)
+    bound_handshakes()
+    async with without_pages(Scheduler)(
+        host=_HOST, port=0, protocol="tls", security=security, dashboard=False
+    ) as scheduler:
+        parent.sendall(encode_message(scheduler.address))
+        await scheduler.finished()
+
+
+async def _worker(order: NodeOrder) -> None:
+    from distributed import Worker
+
+    bound_handshakes()
+    security = security_of(order.certificate, order.key)
+    with tempfile.TemporaryDirectory(prefix="rse-pf-batch-") as folder:
+        async with without_pages(Worker)(
+            order.address, host=_HOST, nthreads=1, security=security, local_directory=folder,
+            memory_limit=0, death_timeout=_DEATH_TIMEOUT_S,
+        ) as worker:  # fmt: skip
+            await worker.finished()
+
+
+@functools.lru_cache(maxsize=1)
+def _store_of(settings: bytes) -> ObjectStore:
+    return open_data_store(PlatformSettings.from_dict(msgspec.json.decode(settings)))

@@ -1,0 +1,45 @@
+"""The ATE that evo computes, where it is installed: by its own command, in a process of its own.
+
+evo is GPL-3 software: it is never imported here, and gets trajectory files only.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from client_sdk.trajectory import write_trajectory
+from rse_pf.extensions.experiments.results.trajectory_error import Accuracy
+
+__all__ = ["evo_ate_cm", "evo_command"]
+
+_COMMAND = "evo_ape"
+_RMSE = re.compile(r"^\s*rmse\s+([0-9.eE+-]+)\s*$", re.MULTILINE)
+_WAIT_S = 60.0
+_SAME_S = "0.001"
+
+
+def evo_command() -> str | None:
+    """Return the path of ``evo_ape``, beside this interpreter or on the path; None without evo."""
+    beside = Path(sys.executable).with_name(_COMMAND)
+    return str(beside) if beside.is_file() else shutil.which(_COMMAND)
+
+
+def evo_ate_cm(command: str, errors: Accuracy) -> float | None:
+    """Return evo's rmse of the positions that *errors* compares, aligned by evo; None if it gives none."""
+    with tempfile.TemporaryDirectory() as name:
+        truth, estimate = Path(name) / "truth.txt", Path(name) / "estimate.txt"
+        write_trajectory(truth, errors.truth)
+        write_trajectory(estimate, errors.compared)
+        words = [command, "tum", str(truth), str(estimate), "--align", "--t_max_diff", _SAME_S]
+        words += [] if errors.has_unit else ["--correct_scale"]
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, timeout=_WAIT_S, check=False)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+    found = _RMSE.search(done.stdout)
+    return None if done.returncode != 0 or found is None else 100 * float(found[1])

@@ -1,0 +1,208 @@
+"""The faults of a demo with a live map: what is done to its platform while the robots drive, and when.
+
+The moment of the fault is drawn from a seed.  Each change of the map's lease is recorded as it is seen in the
+store, every 20 ms; figures are computed from these records by
+`rse_pf.extensions.experiments.results.live_faults`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import signal
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import CommandFailed, NotFound, RsePfError
+from rse_pf.extensions.experiments.demo.live import LIVE_NAME
+from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.faults.failing_store import failing_environment, set_failing_percent
+from rse_pf.local.faults.faults import signal_tree
+from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
+from rse_pf.server.live_map.lease import LeaseRecord, decode_lease, lease_name
+from rse_pf.storage.object_store import DirectoryStore
+
+__all__ = ["LIVE_FAULTS", "Disturbance", "LiveFault"]
+
+LIVE_FAULTS = {
+    "none": 0.0, "kill": 0.0, "stop": 10.0, "drain": 0.0, "roll": 0.0, "store": 10.0, "wifi": 30.0
+}  # fmt: skip
+"""Every fault by its name on the command line, and its duration in seconds."""
+_FAILING_PERCENT = 30.0
+_EARLIEST, _LATEST = 0.16, 0.5
+"""The moment of a fault as a share of the drive; a long fault begins in the first half of this."""
+_LONG_S = 20.0
+_WATCH_S = 0.02
+_OWNER_S = 20.0
+_CUT_ROBOT = 0
+_OFFLINE_ANSWER_S = 0.5
+"""A robot whose Wi-Fi may fail answers itself after this."""
+
+Log = Callable[..., None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveFault:
+    """One fault of `LIVE_FAULTS`; *seed* draws its moment, and ``speed`` shortens what lasts."""
+
+    name: str
+    seed: int = 0
+
+    @property
+    def has_offload(self) -> bool:
+        """Whether the robots solve poses themselves where the cloud does not answer, and keep keyframes."""
+        return self.name == "wifi"
+
+    def settings(self, settings: PlatformSettings) -> PlatformSettings:
+        """Return the settings of the platform: the whole log is kept, for its replay."""
+        changed = settings.replace(live={"keep_log": True})
+        return (
+            changed.replace(session={"answer_timeout_s": _OFFLINE_ANSWER_S}) if self.has_offload else changed
+        )
+
+    def moment_s(self, drive_s: float) -> float:
+        """Return when the fault comes in a drive of *drive_s*."""
+        latest = (_EARLIEST + _LATEST) / 2 if LIVE_FAULTS[self.name] > _LONG_S else _LATEST
+        return drive_s * random.Random(self.seed).uniform(_EARLIEST, latest)
+
+    @contextlib.contextmanager
+    def environment(self, folder: Path) -> Any:
+        """Start the platform inside this block: its store can fail then."""
+        with failing_environment(folder) if self.name == "store" else contextlib.nullcontext():
+            yield
+
+    @contextlib.asynccontextmanager
+    async def disturb(self, platform: LocalPlatform, store: Path, log: Log) -> AsyncIterator[Disturbance]:
+        """Watch the lease of the map in the platform's objects; yield what begins and ends the fault."""
+        async with AsyncExitStack() as stack:
+            link = None
+            if self.name == "wifi":
+                parts = urlsplit(platform.url)
+                link = await stack.enter_async_context(
+                    LinkProcess(PROFILES["none"], parts.hostname or "", parts.port or 0)
+                )
+            disturbance = Disturbance(self, platform, store, link, log)
+            disturbance.watch()
+            try:
+                yield disturbance
+            finally:
+                await disturbance.end()
+
+
+class Disturbance:
+    """A fault in a running demo."""
+
+    def __init__(
+        self, fault: LiveFault, platform: LocalPlatform, folder: Path, link: LinkProcess | None, log: Log
+    ) -> None:
+        self._fault, self._platform, self._folder = fault, platform, folder
+        self._link, self._log = link, log
+        self._store = DirectoryStore(folder / "platform" / "objects")
+        self._lease: LeaseRecord | None = None
+        self._watching: asyncio.Task[None] | None = None
+        self._acting: asyncio.Task[None] | None = None
+
+    def watch(self) -> None:
+        """Begin to watch the lease of the map."""
+        self._watching = asyncio.create_task(self._watch())
+
+    def url_of(self, robot: int) -> str:
+        """Return where *robot* 0, 1, ... connects."""
+        if self._link is None or robot != _CUT_ROBOT:
+            return self._platform.url
+        return urlsplit(self._platform.url)._replace(netloc=f"127.0.0.1:{self._link.port}").geturl()
+
+    def begin(self, start_after_s: float, drive_s: float) -> None:
+        """Let the fault come at its moment; the robots start after *start_after_s*."""
+        self._acting = asyncio.create_task(self._act(start_after_s + self._fault.moment_s(drive_s)))
+
+    async def finish(self) -> None:
+        """Wait until the fault is over; raises what injecting it raised."""
+        if self._acting is not None:
+            await self._acting
+
+    async def end(self) -> None:
+        """Stop all that is done here."""
+        tasks = [task for task in (self._watching, self._acting) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _act(self, after_s: float) -> None:
+        await asyncio.sleep(after_s)
+        name, seconds = self._fault.name, LIVE_FAULTS[self._fault.name]
+        if name == "none":
+            return
+        owner = await self._owner()
+        event = {"fault": name, "seconds": seconds}
+        if name == "wifi":
+            assert self._link is not None
+            self._log("fault", **event, robot=f"robot-{_CUT_ROBOT + 1}")
+            await self._link.cut()
+            await asyncio.sleep(seconds)
+            await self._link.heal()
+        elif name == "store":
+            self._log("fault", **event, percent=_FAILING_PERCENT)
+            await self._fail_store(seconds)
+        elif name == "roll":
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
+            await self._platform.roll()
+        elif name == "drain":
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
+            await self._platform.drain(owner.server, reason="experiment: drain of the owner's server")
+        elif name == "kill":
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
+            self._platform.kill(owner.server)
+        else:
+            await self._stop(owner, event)
+        self._log("fault-over", fault=name)
+
+    async def _stop(self, owner: LeaseRecord, what: dict[str, Any]) -> None:
+        """Stop all processes of the owner's server, the owner among them, and let them go on."""
+        server = next(candidate for candidate in self._platform.servers if candidate.name == owner.server)
+        self._log("fault", **what, owner=owner.owner, server=owner.server)
+        stopped = signal_tree(server.mark, signal.SIGSTOP)
+        self._log("stopped", processes=stopped)
+        try:
+            await asyncio.sleep(what["seconds"])
+        finally:
+            signal_tree(server.mark, signal.SIGCONT)
+
+    async def _fail_store(self, seconds: float) -> None:
+        folder = self._folder / "failing-store"
+        set_failing_percent(folder, _FAILING_PERCENT)
+        try:
+            await asyncio.sleep(seconds)
+        finally:
+            set_failing_percent(folder, 0.0)
+
+    async def _owner(self) -> LeaseRecord:
+        """Return who owns the map, once somebody does."""
+        for _ in range(round(_OWNER_S / _WATCH_S)):
+            if self._lease is not None and self._lease.state == "serving":
+                return self._lease
+            await asyncio.sleep(_WATCH_S)
+        raise CommandFailed("no server owns the live map", hint="let the robots drive for longer")
+
+    async def _watch(self) -> None:
+        """Record each change of the lease but for its renewals."""
+        name = lease_name(DEFAULT_TENANT, LIVE_NAME)
+        while True:
+            with contextlib.suppress(NotFound, RsePfError):
+                record = decode_lease(name, await asyncio.to_thread(self._store.get, name))
+                known, self._lease = self._lease, record
+                if known is None or (record.owner, record.state) != (known.owner, known.state):
+                    self._log(
+                        "lease",
+                        owner=record.owner,
+                        server=record.server,
+                        state=record.state,
+                        epoch=record.epoch,
+                    )
+            await asyncio.sleep(_WATCH_S)

@@ -1,0 +1,388 @@
+"""One robot of the demo, in a process of its own: it tracks frames and writes its map and its records.
+
+Like a user's robot it uses the public SDK and a token, and nothing of the platform.  It writes its files even
+if frames were lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from client_sdk.check.drive_check import DriveCheck
+from client_sdk.check.motion import MotionReference
+from client_sdk.commands.answer_types import PoseAnswer
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.live import LiveMapper, LiveOptions
+from client_sdk.mapper import Mapper, ask_robot
+from client_sdk.offloading.offload_policy import CloudFirst
+from client_sdk.plugins import load_features
+from client_sdk.point_map import write_ply
+from client_sdk.robot import Robot
+from client_sdk.source_facts import DoubtLog, unresolved
+from client_sdk.trajectory import Trajectory, write_trajectory
+from rse_pf.config import SessionSettings
+from rse_pf.errors import RsePfError, error_of_system
+from rse_pf.extensions.experiments.child_process import ChildFailed, ChildReady, ParentPipe
+from rse_pf.extensions.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
+from rse_pf.extensions.experiments.demo.live import LIVE_NAME, LiveRecorder
+from rse_pf.extensions.experiments.demo.merge import MAP_FILE
+from rse_pf.extensions.experiments.results.records import CommandRecord
+
+if TYPE_CHECKING:
+    from client_sdk.datasets import CameraChoice, Dataset
+
+__all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
+
+_ROBOT_NICE = 5
+"""Robots of the demo share a machine with the servers, which go first; elsewhere a robot has its own."""
+_MIN_READINGS = 2
+_OWN_SOLVER_S = 0.2
+"""A robot whose cloud does not answer begins so long before the deadline: it shares the machine with all."""
+_DEFAULT_FRAMES = 80
+_LEAST_MERGE_FRAMES = 150
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions:
+    """Options of the command line.
+
+    ``data`` None means the rendered world; ``camera`` and ``imu`` None mean what the recording has.
+    """
+
+    data: Path | None = None
+    camera: CameraChoice | None = None
+    imu: bool | None = None
+    robots: int = 3
+    rate_hz: float = 5.0
+    engine: str = "native"
+    codec: str = "zlib"
+    out: Path = Path("out")
+    frames: int | None = None
+    seed: int = 0
+    frontend: str = "standard"
+    features: str | None = None
+    merge: bool = False
+    live: bool = False
+    quiet: bool = False
+    check: bool = False
+    """Whether drives of a recording are checked."""
+    accepted: tuple[str, ...] = ()
+    """Names of doubts about the recording that the user takes for right."""
+    shown: tuple[str, ...] = ()
+    """Lines of doubts about the recording that the user has seen before the drive."""
+
+    @property
+    def frame_count(self) -> int:
+        """The frames of each robot in the rendered world; to merge, it must see what the next one saw."""
+        from client_sdk.simulator import frames_to_overlap
+
+        if self.frames or not (self.merge or self.live):
+            return self.frames or _DEFAULT_FRAMES
+        return max(_LEAST_MERGE_FRAMES, frames_to_overlap(self.robots))
+
+    def share(self, robot: int) -> Dataset:
+        """Return the frames of the recording that *robot* 0, 1, ... plays; raises UsageError."""
+        from client_sdk.datasets import open_dataset
+
+        assert self.data is not None
+        recording = open_dataset(self.data, camera=self.camera, imu=self.imu)
+        return recording.thinned(self.rate_hz).share(robot, self.robots)
+
+    @property
+    def frontend_options(self) -> FrontEndOptions:
+        """The options of the trackers."""
+        wide = self.frontend == "wide-baseline"
+        standard = FrontEndOptions.live() if self.live else FrontEndOptions()
+        options = FrontEndOptions.wide_baseline() if wide else standard
+        return options.sent_with(self.codec)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotSpec:
+    """What one robot needs besides the options of the demo."""
+
+    name: str
+    number: int
+    url: str
+    folder: Path
+    options: DemoOptions
+    session: SessionSettings
+    has_offload: bool = False
+    """Whether it solves poses itself where the cloud does not answer, and keeps keyframes on its disk."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDone:
+    """From the robot: a frame was loaded or, after the start, tracked."""
+
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotFinished:
+    """From the robot: its figures at the end; its map and trajectory are in its folder.
+
+    Without *is_metric* the trajectory is in a unit of its own.
+    """
+
+    frames: int
+    lost_frames: int
+    keyframes: int
+    weak_poses: int
+    map_points: int
+    fps: float
+    matches: list[int]
+    inliers: list[int]
+    commands: list[CommandRecord]
+    trajectory: Trajectory
+    truth: Trajectory | None
+    truth_kind: str
+    frames_before_start: int = 0
+    """Frames of a camera without depth before it had moved enough."""
+    not_started_because: str = ""
+    """Why a camera without depth has no pose at all; empty if it has."""
+    stats: dict[str, Any] = field(default_factory=dict)
+    is_metric: bool = True
+    check: dict[str, Any] | None = None
+    """What the check of the drive found; None if there was none."""
+
+
+@dataclass(slots=True)
+class _Drive:
+    """The records of the robot while it drives."""
+
+    commands: list[CommandRecord] = field(default_factory=list)
+    tracked: list[TrackedFrame] = field(default_factory=list)
+    weak_poses: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Loaded:
+    """Frames to play, with the truth of them."""
+
+    frames: Any
+    truth: Trajectory | None
+    truth_kind: str
+    has_depth: bool
+    is_thinned: bool = False
+    log: DoubtLog = field(default_factory=DoubtLog)
+
+
+def run_robot(spec: RobotSpec, pipe: Connection) -> None:
+    """Load the frames, connect, wait for the start, track; the entry point of the process."""
+    os.nice(_ROBOT_NICE)
+    parent = ParentPipe(pipe, spec.name)
+    parent.listen()
+    try:
+        asyncio.run(_run(spec, parent))
+    except RsePfError as error:
+        parent.send(ChildFailed(error.report()))
+    except OSError as error:
+        parent.send(ChildFailed(error_of_system(error).report()))
+    except KeyboardInterrupt:
+        pass
+
+
+async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
+    from client_sdk import connect
+
+    options = spec.options
+    loaded = await asyncio.to_thread(_load, spec, pipe)
+    frames, truth = loaded.frames, loaded.truth
+
+    async def token() -> str:
+        return await asyncio.to_thread(pipe.fresh_token)
+
+    offload = CloudFirst(slack_s=_OWN_SOLVER_S) if spec.has_offload else None
+    async with connect(
+        spec.url, token=token, codec=options.codec, settings=spec.session, offload=offload
+    ) as robot:
+        began = planned = 0.0
+        drive = _Drive()
+
+        async def ask(query: PoseQuery) -> PoseAnswer:
+            return await _solve(robot, query, planned, began, spec, drive)
+
+        mapper: Mapper | LiveMapper
+        async with AsyncExitStack() as stack:
+            if options.live:
+                shared = LiveMapper(
+                    robot, LIVE_NAME, ask=ask, options=options.frontend_options,
+                    live=LiveOptions().sent_with(options.codec), features=load_features(options.features),
+                    spool=spec.folder / "spool" if spec.has_offload else None, store=robot.store_object,
+                )  # fmt: skip
+                mapper = await stack.enter_async_context(shared)
+            else:
+                start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
+                mapper = Mapper(
+                    ask=ask, depth=loaded.has_depth, options=options.frontend_options, T_world_start=start,
+                    features=load_features(options.features),
+                )  # fmt: skip
+            pipe.send(ChildReady(len(frames)))
+            began = planned = await asyncio.to_thread(pipe.wait_start)
+            collector = _collector(spec, pipe.token)
+            recorder = LiveRecorder(shared, time.monotonic, began).start() if options.live else None
+            check = DriveCheck(
+                is_wanted=options.check and options.data is not None, is_thinned=loaded.is_thinned
+            )
+            first_s = time.monotonic()
+            waiting = iter(frames)
+            following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
+            for row in range(len(frames)):
+                frame: Frame | None = await following
+                if frame is None:  # damaged images are left out
+                    break
+                planned = began + (row + spec.number / options.robots) / options.rate_hz
+                await asyncio.sleep(max(0.0, planned - time.monotonic()))
+                # The next frame is read while this one is tracked, as a camera's driver would.
+                following = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
+                done = await mapper.track(frame)
+                if recorder is not None:
+                    recorder.frame(done)
+                if done.T_world_camera is not None and collector is not None:
+                    await asyncio.to_thread(collector.add, done)
+                drive.tracked.append(done)
+                await asyncio.to_thread(check.add, frame, done)
+                pipe.send(FrameDone(row + 1))
+            took_s = time.monotonic() - first_s
+        if recorder is not None:
+            await recorder.finish(spec.folder, truth)
+        trajectory = mapper.trajectory
+        uploaded = await asyncio.to_thread(_write, spec.folder, mapper, trajectory, collector)
+        pipe.send(
+            RobotFinished(
+                frames=mapper.frames,
+                lost_frames=mapper.lost_frames,
+                frames_before_start=mapper.frames_before_start,
+                not_started_because=mapper.start_reason,
+                keyframes=mapper.keyframes,
+                weak_poses=drive.weak_poses,
+                map_points=len(mapper.map),
+                fps=mapper.frames / max(took_s, 1e-9),
+                matches=[done.matches for done in drive.tracked[1:]],
+                inliers=[done.inliers for done in drive.tracked[1:]],
+                commands=drive.commands,
+                trajectory=trajectory,
+                truth=truth,
+                truth_kind=loaded.truth_kind,
+                stats={
+                    "reconnects": robot.stats.reconnects,
+                    "resent": robot.stats.resent,
+                    "keyframes_uploaded": uploaded,
+                },
+                is_metric=_is_metric(mapper),
+                check=await asyncio.to_thread(_checked, check, mapper, loaded, options.accepted),
+            )
+        )
+
+
+def _checked(
+    check: DriveCheck, mapper: Mapper | LiveMapper, loaded: _Loaded, accepted: Sequence[str]
+) -> dict[str, Any] | None:
+    """Return what is wrong with the drive.  Its files are written: pairs may be adjusted."""
+    offsets = mapper.adjust_pairs() if check.is_wanted and isinstance(mapper, Mapper) else {}
+    reference = MotionReference.of_truth(loaded.truth, loaded.truth_kind, is_camera=False)
+    return check.finish(reference, offsets, unresolved(loaded.log.doubts, accepted), accepted)
+
+
+def _is_metric(mapper: Mapper | LiveMapper) -> bool:
+    """Return whether poses of the odometry are metres; those of one lens in a live map never are."""
+    return mapper.scale.startswith("metric") and getattr(mapper, "metres_per_unit", 1.0) == 1.0
+
+
+async def _solve(
+    robot: Robot, query: PoseQuery, planned: float, began: float, spec: RobotSpec, drive: _Drive
+) -> PoseAnswer:
+    """Request one pose from the platform, and record how that went."""
+    sent = time.monotonic()
+    record = CommandRecord(
+        id=len(drive.commands) + 1,
+        robot=spec.name,
+        planned=round(planned - began, 6),
+        sent=round(sent - began, 6),
+        answered=None,
+        server="",
+        code="",
+    )
+    try:
+        answer = await ask_robot(robot.solve_pnp, spec.session.answer_timeout_s)(query)
+    except RsePfError as error:
+        drive.commands.append(replace(record, answered=_since(began), code=error.code))
+        raise
+    drive.commands.append(
+        replace(
+            record,
+            answered=_since(began),
+            server=answer.server,
+            code="ok",
+            source=answer.source,
+            payload_bytes=answer.payload_bytes,
+            round_trip_ms=answer.round_trip_ms,
+            up_ms=answer.up_ms,
+            queue_ms=answer.queue_ms,
+            compute_ms=answer.compute_ms,
+            down_ms=answer.down_ms,
+        )
+    )
+    drive.weak_poses += answer.solution.verdict == "weak"
+    return answer
+
+
+def _since(began: float) -> float:
+    return round(time.monotonic() - began, 6)
+
+
+def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
+    """Return the frames and the truth; the world is rendered before the start."""
+    options, number = spec.options, spec.number
+    if options.data is not None:
+        recording = options.share(number)
+        is_thinned = int(np.ptp(recording.rows)) >= len(recording)
+        return _Loaded(
+            recording, recording.truth, recording.truth_kind, recording.has_depth, is_thinned, recording.log
+        )
+    from client_sdk.simulator import render_frames, true_trajectory
+
+    truth = true_trajectory(number, options.robots, options.frame_count, options.seed)
+    frames: list[Frame] = []
+    for frame in render_frames(number, options.robots, options.frame_count, options.seed):
+        frames.append(frame)
+        pipe.send(FrameDone(len(frames)))
+    return _Loaded(frames, truth, "ground truth", True)
+
+
+def _collector(spec: RobotSpec, token: Callable[[], str]) -> KeyframeCollector | None:
+    if not spec.options.merge:
+        return None
+    uploads = KeyframeUploads(spec.url, token)
+    features = load_features(spec.options.features)
+    return KeyframeCollector(spec.name, spec.options.frontend_options, uploads, features)
+
+
+def _write(
+    folder: Path, mapper: Mapper | LiveMapper, trajectory: Trajectory, collector: KeyframeCollector | None
+) -> int:
+    """Write the files of the robot, upload its map, and return how many keyframes were uploaded."""
+    points, colours = mapper.map.points(min_readings=_MIN_READINGS)
+    write_ply(folder / "map.ply", points, colours)
+    write_trajectory(
+        folder / "trajectory.txt",
+        trajectory,
+        is_metric=_is_metric(mapper),
+        T_body_camera=mapper.T_body_camera,
+    )
+    if collector is None:
+        return 0
+    data = collector.encoded_map(points, colours)
+    (folder / MAP_FILE).write_bytes(data)
+    return collector.share(data)

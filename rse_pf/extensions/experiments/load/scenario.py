@@ -1,0 +1,103 @@
+"""What the robots of a load do, as one value and one file, for both load generators.
+
+`rse_pf.extensions.experiments.load.swarm` drives the robots by the real SDK; the generator in C of
+``benchmarks`` drives more of them, by the same messages at the same rate.  Where they connect is not part of
+it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rse_pf.errors import UsageError
+from rse_pf.local.faults.network_emulator import profile_named
+from rse_pf.wire import CODECS
+
+__all__ = ["LoadScenario", "read_scenario", "write_scenario"]
+
+SERVICES = ("pnp", "echo")
+"""Services that the robots can call, because their true answers are known."""
+
+_MAX_ROBOTS, _MAX_PROCESSES, _MAX_FPS, _MAX_MATCHES = 10_000, 16, 200.0, 5000
+_MAX_S = 86400.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadScenario:
+    """Number of robots and what they do; raises UsageError for a value out of range.
+
+    Robot k connects ``k * join_every_s`` after the start; ``seconds`` count from when all have joined.
+    ``keep`` asks the platform to answer every frame, not only the newest.  ``link`` names a profile of
+    `rse_pf.local.faults.network_emulator`, and ``processes`` those of the generator in Python.
+    """
+
+    robots: int = 10
+    fps: float = 5.0
+    seconds: float = 20.0
+    codec: str = "zlib"
+    matches: int = 200
+    outliers: float = 0.3
+    seed: int = 0
+    join_every_s: float = 0.0
+    deadline_s: float = 5.0
+    keep: bool = True
+    service: str = "pnp"
+    processes: int = 1
+    link: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _within("robots", self.robots, 1, _MAX_ROBOTS)
+        _within("fps", self.fps, 0.01, _MAX_FPS)
+        _within("seconds", self.seconds, 0.01, _MAX_S)
+        _within("matches", self.matches, 4, _MAX_MATCHES)
+        _within("outliers", self.outliers, 0.0, 0.9)
+        _within("seed", self.seed, 0, 2**31)
+        _within("join_every_s", self.join_every_s, 0.0, 3600.0)
+        _within("deadline_s", self.deadline_s, 0.01, 3600.0)
+        _within("processes", self.processes, 1, _MAX_PROCESSES)
+        for name, value, known in (("codec", self.codec, CODECS), ("service", self.service, SERVICES)):
+            if value not in known:
+                raise UsageError(f"no {name} named {value!r}", hint=f"choose one of {', '.join(known)}")
+        if self.link is not None:
+            profile_named(self.link)
+
+
+def read_scenario(file: Path) -> LoadScenario:
+    """Read a JSON object whose members are fields of `LoadScenario`; the others have their defaults.
+
+    Raises:
+        UsageError: The file cannot be read, holds something else, or a value is out of range.
+    """
+    hint = "write one JSON object, as in scenario.json in the results of rse-pf swarm"
+    try:
+        members = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+        known = [field.name for field in fields(LoadScenario)]
+        for name in members:
+            if name not in known:
+                raise UsageError(f"{file}: a scenario has no {name!r}", hint=f"it has {', '.join(known)}")
+        return msgspec.convert(members, LoadScenario)
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {file}: {error.strerror}", hint="name the file of a scenario"
+        ) from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(f"{file} is no scenario: {error}", hint=hint) from error
+
+
+def write_scenario(file: Path, scenario: LoadScenario) -> Path:
+    """Write what `read_scenario` reads; return *file*."""
+    file.write_text(json.dumps(asdict(scenario), indent=2) + "\n", encoding="utf-8")
+    return file
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise UsageError(
+            f"{name} = {value:g} is not within {low:g}..{high:g}",
+            hint=f"give a value from {low:g} to {high:g}",
+        )

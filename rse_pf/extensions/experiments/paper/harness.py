@@ -1,0 +1,234 @@
+"""The harness of an experiment: a local platform, its robots, and every record of them while they run.
+
+`Harness` opens the record files before anything starts, so that a killed run leaves its events.  When it
+ends, nothing that it started is running, and no key is left in the folder of results.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AsyncExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.extensions.experiments.load.scenario import LoadScenario
+from rse_pf.extensions.experiments.load.swarm import Swarm, SwarmResult
+from rse_pf.extensions.experiments.results.records import (
+    COMMANDS,
+    EVENTS,
+    SAMPLES,
+    EventLog,
+    Records,
+    SampleLog,
+    event_details,
+    sample_from_document,
+    write_commands,
+)
+from rse_pf.extensions.experiments.results.result_folder import remove_keys
+from rse_pf.local.control.control_plane import ControlOptions
+from rse_pf.local.control.monitor import MonitorSample
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.scaling.profile import cadence_of
+
+__all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]
+
+_SERVER_CHANGES = {
+    "grow", "shrink", "replace", "server-launched", "server-healthy", "server-gone", "phase",
+}  # fmt: skip
+
+
+class Harness:
+    """A platform whose events and samples are recorded; ``async with`` starts and ends it."""
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: PlatformSettings,
+        parameters: Mapping[str, Any],
+        *,
+        elastic: bool = True,
+        compress: float = 1.0,
+        rebalance: bool = True,
+        servers: int | None = None,
+    ) -> None:
+        """Describe a run; nothing is started.
+
+        Args:
+            folder: Folder of the records; it exists and is empty.
+            settings: Settings of the platform.
+            parameters: Parameters of this run, for its first event.
+            elastic: Whether monitor and scale modifier act.
+            compress: Factor by which their periods are shortened.
+            rebalance: Whether robots migrate from crowded servers.
+            servers: Number of servers at the start; None means that of the settings.
+        """
+        self.folder = folder
+        self.settings = settings
+        self.origin_s = 0.0
+        self.events: list[dict[str, Any]] = []
+        self.samples: list[MonitorSample] = []
+        self.link: Any = None
+        self._parameters = {**parameters, **policy_parameters(settings, compress)}
+        self._servers = servers
+        self._control = ControlOptions(
+            elastic=elastic, compress=compress, rebalance=rebalance, on_sample=self._on_sample
+        )
+        self._stack = AsyncExitStack()
+        self._changed = asyncio.Event()
+        self._event_log: EventLog
+        self._sample_log: SampleLog
+        self.platform: LocalPlatform
+
+    async def __aenter__(self) -> Harness:
+        """Open the records and start the platform; raises what LocalPlatform raises."""
+        self.origin_s = time.monotonic()
+        events, samples = (
+            self._stack.enter_context((self.folder / name).open("w", newline="", encoding="utf-8"))
+            for name in (EVENTS, SAMPLES)
+        )
+        self._event_log, self._sample_log = EventLog(events), SampleLog(samples)
+        self.log("experiment", **self._parameters, origin_s=self.origin_s)
+        platform = LocalPlatform(
+            self.settings,
+            state=self.folder / "platform",
+            port=0,
+            name="experiment",
+            on_event=lambda event: self.log(str(event["event"]), **event_details(event)),
+            servers=self._servers,
+            control=self._control,
+        )
+        try:
+            self.platform = await self._stack.enter_async_context(platform)
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the platform, close the records, delete the keys."""
+        await self._stack.aclose()
+        remove_keys(self.folder / "platform")
+
+    def now(self) -> float:
+        """Return seconds since the start of the run."""
+        return time.monotonic() - self.origin_s
+
+    def log(self, action: str, **details: Any) -> None:
+        """Record an event that happens now."""
+        self._record(self.now(), action, details)
+
+    def swarm(self, options: LoadScenario) -> Swarm:
+        """Return the robots of this run; start them with ``async with``."""
+        return Swarm(
+            options,
+            url=self.platform.url,
+            token_of=self.platform.issue_token,
+            session=self.settings.session,
+            on_event=lambda event: self._record(
+                float(event.get("time", self.now())), str(event["event"]), event_details(event)
+            ),
+            origin=self.origin_s,
+        )
+
+    async def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until *condition* holds, evaluated after each event and sample; return whether it did."""
+        end = time.monotonic() + timeout_s
+        while not condition():
+            left = end - time.monotonic()
+            if left <= 0:
+                return False
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), min(left, 1.0))
+            except asyncio.TimeoutError:
+                continue
+        return True
+
+    async def run_for(self, seconds: float) -> None:
+        """Let the run go on for *seconds*."""
+        await self.wait_for(lambda: False, seconds)
+
+    async def wait_quiet(self, quiet_s: float, timeout_s: float) -> bool:
+        """Wait until the number of servers was not changed for *quiet_s*; return whether that happened."""
+
+        def quiet() -> bool:
+            times = (event["time"] for event in self.events if event["action"] in _SERVER_CHANGES)
+            return self.now() - max(times, default=0.0) >= quiet_s
+
+        return await self.wait_for(quiet, timeout_s)
+
+    def events_since(self, action: str, since_s: float) -> list[dict[str, Any]]:
+        """Return the events *action* since *since_s*."""
+        return [event for event in self.events if event["action"] == action and event["time"] >= since_s]
+
+    def busiest(self) -> Any:
+        """Return the server with the most robots, an entry of `LocalPlatform.servers`."""
+        robots = {row.name: row.robots for row in self.samples[-1].servers} if self.samples else {}
+        servers = self.platform.servers
+        if not servers:
+            raise CommandFailed("no server is left", hint=f"look at {self.folder / 'platform'}/*.log")
+        return max(servers, key=lambda server: (robots.get(server.name, 0), server.name))
+
+    def kill(self, watch_s: float) -> str:
+        """Send SIGKILL to the busiest server and record the fault; return its name."""
+        victim = self.busiest()
+        self.log("fault", fault="kill -9", server=victim.name, pid=victim.pid, watch_s=watch_s)
+        os.kill(victim.pid, signal.SIGKILL)
+        return str(victim.name)
+
+    async def save_result(self, result: SwarmResult) -> None:
+        """Write the commands of the robots and the figures of the load generator."""
+        await asyncio.to_thread(write_commands, self.folder / COMMANDS, result.commands)
+        self.log("generator", **generator_event(result))
+
+    def _record(self, time_s: float, action: str, details: Mapping[str, Any]) -> None:
+        self.events.append({"time": time_s, "action": action, **details})
+        self._event_log.write(time_s, action, **details)
+        self._changed.set()
+
+    def _on_sample(self, document: Mapping[str, Any]) -> None:
+        sample = sample_from_document(document, self.origin_s)
+        self.samples.append(sample)
+        self._sample_log.write(sample)
+        self._changed.set()
+
+
+def generator_event(result: SwarmResult) -> dict[str, Any]:
+    """Return the figures of the load generator, for the event ``generator``."""
+    same = ("cpu_s", "wall_s", "wrong_poses", "reconnects", "resent", "moves")
+    return {
+        **{name: getattr(result, name) for name in same},
+        "twice": result.duplicates,
+        "late_sends": result.late_sends_ms_p99,
+    }
+
+
+def generator_of(records: Records) -> dict[str, Any]:
+    """Return the figures of the load generator of a run; raises UsageError if the run did not end."""
+    for event in records.events:
+        if event["action"] == "generator":
+            return event_details(event)
+    raise UsageError("the events hold no figures of the load generator", hint="run the experiment again")
+
+
+def policy_parameters(settings: PlatformSettings, compress: float) -> dict[str, Any]:
+    """Return the parameters of the scaling policy, with its periods after compression."""
+    scaling, cadence = settings.scaling, cadence_of(settings.scaling)
+    return {
+        "min_servers": scaling.min_servers,
+        "max_servers_allowed": scaling.max_servers,
+        "busy_cpu_percent": scaling.busy_cpu_percent,
+        "busy_periods": cadence.busy,
+        "period_s": cadence.period_s / compress,
+        "idle_s": scaling.idle_s / compress,
+        "size": settings.serving.emulated_cores,
+    }

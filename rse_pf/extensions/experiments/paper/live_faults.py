@@ -1,0 +1,109 @@
+"""The faults of live maps, each on a platform of its own: what robots notice, and what the map keeps.
+
+A run is the demo with --live and one fault at a moment that its seed draws.  The whole log of the map stays
+in the folder of the run, so that ``verify`` replays it and computes every figure again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.extensions.experiments.demo.live_faults import LIVE_FAULTS, LiveFault
+from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
+from rse_pf.extensions.experiments.paper.mapping import complete_records, frames_of
+from rse_pf.extensions.experiments.plots.figures import draw_live, require_matplotlib
+from rse_pf.extensions.experiments.results.live_error import read_live_drives, read_live_map
+from rse_pf.extensions.experiments.results.live_faults import fault_rows, live_fault_figures
+from rse_pf.extensions.experiments.results.markdown import about_run, number, page, table
+from rse_pf.extensions.experiments.results.records import read_records
+from rse_pf.extensions.experiments.results.result_folder import (
+    RUN_FILES,
+    finish_report,
+    fresh_folder,
+    load_average,
+)
+from rse_pf.terminal import show
+
+__all__ = ["LIVE_FAULTS", "live_faults_page", "run_live_fault", "run_live_faults"]
+
+_FIGURE = "live.png"
+
+
+def run_live_faults(
+    options: DemoOptions, settings: PlatformSettings, faults: Sequence[str], repeat: int = 1
+) -> int:
+    """Run each of *faults* *repeat* times; return 1 if an acknowledged keyframe or a frame was lost."""
+    require_matplotlib()
+    folder = fresh_folder(
+        options.out, [*RUN_FILES, *LIVE_FAULTS, *(f"{name}-[1-9]*" for name in LIVE_FAULTS)]
+    )
+    load_before = load_average()
+    runs: dict[str, dict[str, Any]] = {}
+    for fault in faults:
+        for turn in range(repeat):
+            name = fault if repeat == 1 else f"{fault}-{turn + 1}"
+            runs[name] = run_live_fault(
+                replace(options, out=folder / name), settings, LiveFault(name=fault, seed=options.seed + turn)
+            )
+            show(*_lines(runs))
+    report = {
+        "experiment": "live",
+        "asked": {
+            "robots": options.robots,
+            "fps": options.rate_hz,
+            "data": options.data and options.data.name,
+            "frames": options.frame_count,
+            "seed": options.seed,
+            "repeat": repeat,
+        },
+        "runs": runs,
+    }
+    finish_report(folder, report, live_faults_page, settings, load_before)
+    show(f"wrote report.json, report.md and the records of each run to {options.out}")
+    keyframe_counts = [run["keyframes"] for run in runs.values()]
+    lost = any(counts["lost"] or counts["twice"] for counts in keyframe_counts)
+    return int(lost or any(run["frames_lost"] for run in runs.values()))
+
+
+def run_live_fault(options: DemoOptions, settings: PlatformSettings, fault: LiveFault) -> dict[str, Any]:
+    """Run the demo with one fault, keep its records in ``options.out``, draw it, and return its figures."""
+    run_demo(options, settings, fault)
+    folder = options.out.resolve()
+    frames = frames_of(options)
+    complete_records(
+        options, settings, folder, frames, kind="live-fault", fault=fault.name, fault_seed=fault.seed
+    )
+    figures = live_fault_figures(read_records(folder))
+    drives = read_live_drives(folder, list(frames))
+    draw_live(folder / _FIGURE, drives, read_live_map(folder), figures["live"])
+    return figures
+
+
+def live_faults_page(report: Mapping[str, Any]) -> str:
+    """Return ``report.md``: a row for each run, each target with whether it was met, and the figures."""
+    runs: Mapping[str, Mapping[str, Any]] = report["runs"]
+    head, *rows = fault_rows(runs)
+    bars = [
+        [name, figure, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
+        for name, run in runs.items()
+        for figure, bar in run["bars"].items()
+    ]
+    return page(
+        "# RSE-PF experiment: faults of a live map",
+        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} Hz; "
+        f"{sum(row[-1] == 'met' for row in bars)} of {len(bars)} targets met.",
+        table(head, rows),
+        table(["fault", "figure", "measured", "target", ""], bars),
+        *(f"![{name}]({name}/{_FIGURE})" for name in runs),
+        about_run(report),
+    )
+
+
+def _lines(runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the newest row of the table, below its head if it is the first."""
+    head, *rows = fault_rows(runs)
+    lines = table(head, [rows[-1]])
+    return lines if len(rows) == 1 else lines[2:]

@@ -1,0 +1,147 @@
+"""The image of trajectories beside the truth: a panel for each recording, across the path's shortest axis.
+
+Drawn with Pillow, like the image of a map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client_sdk.trajectory import Trajectory
+from rse_pf.extensions.experiments.plots.map_image import COLOURS, SCALES_M, fitting, pillow
+from rse_pf.geometry import Array
+from rse_pf.terminal import printable
+
+__all__ = ["DrawnPath", "Panel", "draw_trajectories", "pieces"]
+
+_WIDTH, _HEIGHT, _TITLE, _LEGEND, _MARGIN, _ACROSS = 800, 640, 48, 92, 28, 2
+_PAPER, _INK, _TRUTH, _FRAME = (255, 255, 255), (30, 34, 42), (150, 156, 166), (228, 231, 236)
+_BREAK = 2.5
+"""A path is broken where poses are so many times their usual interval apart."""
+_SCALE_PX = (60.0, 300.0)
+_MOST_PANELS = 24
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnPath:
+    """A path with the name that stands in the legend."""
+
+    name: str
+    path: Trajectory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Panel:
+    """The paths of one recording and their truth, all in one frame; *unit* is that of the scale bar."""
+
+    title: str
+    truth: Trajectory | None
+    paths: tuple[DrawnPath, ...]
+    unit: str = "m"
+
+
+def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
+    """Write a PNG with a panel for each recording; those beyond 24 are left out.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    image_module, draw_module, font_module = pillow()
+    panels = panels[:_MOST_PANELS]
+    across = min(_ACROSS, max(1, len(panels)))
+    down = max(1, math.ceil(len(panels) / across))
+    image = image_module.new("RGB", (across * _WIDTH, down * _HEIGHT), _PAPER)
+    draw = draw_module.Draw(image)
+    fonts = font_module.load_default(size=22), font_module.load_default(size=16)
+    for number, panel in enumerate(panels):
+        _draw_panel(draw, panel, (number % across * _WIDTH, number // across * _HEIGHT), fonts)
+    image.save(path, format="PNG")
+
+
+def pieces(trajectory: Trajectory) -> list[Array]:
+    """Return the ``(n, 3)`` positions of each part of a path without lost frames in between."""
+    if not len(trajectory):
+        return []
+    apart_s = np.diff(trajectory.timestamps_s)
+    usual_s = float(np.median(apart_s)) if len(apart_s) else 0.0
+    return np.split(trajectory.positions, np.flatnonzero(apart_s > _BREAK * usual_s) + 1)
+
+
+def _draw_panel(draw: Any, panel: Panel, corner: tuple[int, int], fonts: tuple[Any, Any]) -> None:
+    left, top = corner
+    big, small = fonts
+    draw.rectangle([left, top, left + _WIDTH - 1, top + _HEIGHT - 1], outline=_FRAME, width=2)
+    title = fitting(draw, printable(panel.title), big, _WIDTH - 2 * _MARGIN)
+    draw.text((left + _MARGIN, top + 12), title, fill=_INK, font=big)
+    shown = [
+        each.positions for each in (panel.truth, *(drawn.path for drawn in panel.paths)) if each is not None
+    ]
+    points = np.concatenate([*shown, np.empty((0, 3))])
+    if not len(points):
+        draw.text((left + _MARGIN, top + _TITLE + 20), "no poses", fill=_INK, font=small)
+        return
+    basis = _basis(points if panel.truth is None else panel.truth.positions)
+    flat = points @ basis
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    room = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - _TITLE - _LEGEND - _MARGIN])
+    scale = float((room / np.maximum(high - low, 1e-6)).min())
+    middle = np.array([left + _WIDTH / 2, top + _TITLE + (room[1] + _MARGIN) / 2])
+
+    def line(trajectory: Trajectory, colour: tuple[int, int, int], width: int) -> None:
+        for piece in pieces(trajectory):
+            pixels = (piece @ basis - (low + high) / 2) * scale + middle
+            places = [(float(x), float(y)) for x, y in pixels]
+            if len(places) == 1:
+                (x, y), half = places[0], width
+                draw.ellipse([x - half, y - half, x + half, y + half], fill=colour)
+            else:
+                draw.line(places, fill=colour, width=width, joint="curve")
+
+    legend = [] if panel.truth is None else [("truth", _TRUTH)]
+    if panel.truth is not None:
+        line(panel.truth, _TRUTH, 7)
+    for number, drawn in enumerate(panel.paths):
+        line(drawn.path, COLOURS[number % len(COLOURS)], 3)
+        legend.append((drawn.name, COLOURS[number % len(COLOURS)]))
+    _draw_scale(draw, scale, (left + _WIDTH - _MARGIN, top + _HEIGHT - _LEGEND - 6), panel.unit, small)
+    _draw_legend(draw, legend, (left + _MARGIN, top + _HEIGHT - _LEGEND + 14), small)
+
+
+def _basis(positions: Array) -> Array:
+    """Return ``(3, 2)``, the two longest axes of the positions."""
+    centred = positions - positions.mean(axis=0)
+    _, _, axes = np.linalg.svd(centred.T @ centred)
+    basis: Array = axes[:2].T
+    return basis
+
+
+def _draw_scale(draw: Any, scale: float, end: tuple[float, float], unit: str, font: Any) -> None:
+    length = next((m for m in SCALES_M if _SCALE_PX[0] <= m * scale <= _SCALE_PX[1]), 1.0)
+    x, y = end
+    draw.line([(x - length * scale, y), (x, y)], fill=_INK, width=3)
+    draw.text((x - length * scale - 10, y), f"{length:g} {unit}", fill=_INK, font=font, anchor="rm")
+
+
+def _draw_legend(
+    draw: Any, entries: Sequence[tuple[str, tuple[int, int, int]]], corner: tuple[float, float], font: Any
+) -> None:
+    """Draw names with their colours, in as many lines as fit; the rest is counted."""
+    left, y = corner
+    x, right, last = left, left + _WIDTH - 2 * _MARGIN, y + _LEGEND - 40
+    for number, (name, colour) in enumerate(entries):
+        text = fitting(draw, printable(name), font, right - left - 40)
+        length = draw.textlength(text, font=font)
+        if x > left and x + 36 + length > right:
+            x, y = left, y + 24
+        if y > last:
+            draw.text((x, y), f"and {len(entries) - number} more", fill=_INK, font=font, anchor="lm")
+            return
+        draw.line([(x, y), (x + 26, y)], fill=colour, width=5)
+        draw.text((x + 34, y), text, fill=_INK, font=font, anchor="lm")
+        x += 56 + length

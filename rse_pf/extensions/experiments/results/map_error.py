@@ -1,0 +1,243 @@
+"""The accuracy of a merged map: the trajectories of its robots in it, and their errors against the truth.
+
+The truth is used for errors alone; a report says which robots were left out of them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from client_sdk.trajectory import Trajectory
+from rse_pf.errors import UsageError
+from rse_pf.extensions.experiments.results.markdown import table
+from rse_pf.extensions.experiments.results.trajectory_error import align, match_truth
+from rse_pf.geometry import Array, inverse, pose_difference
+from rse_pf.maps.format import MapVersion
+from rse_pf.services.mapping.merge import MergeReply
+from rse_pf.terminal import counted
+
+__all__ = ["JoinedRobot", "joined_robots", "merge_section", "merged_lines", "merged_table", "move_frames"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JoinedRobot:
+    """A robot in the merged map: its trajectory in its own world frame, and in that of the map."""
+
+    name: str
+    own: Trajectory
+    merged: Trajectory
+    truth: Trajectory | None
+
+
+def joined_robots(
+    names: Sequence[str],
+    paths: Sequence[Trajectory],
+    truths: Sequence[Trajectory | None],
+    versions: Sequence[MapVersion],
+    reply: MergeReply,
+    merged: MapVersion,
+) -> list[JoinedRobot]:
+    """Return the robots that were joined, with the pose of every frame in the merged map.
+
+    Args:
+        names: Names of the robots, in the order in which their maps were sent.
+        paths: Poses of all frames, each in the world frame of its robot.
+        truths: True poses, in one common world frame, where known.
+        versions: The maps that were sent.
+        reply: Reply of the merge service.
+        merged: The map of *reply*; its provenance says which robot each keyframe is from.
+    """
+    poses: dict[tuple[int, int], Array] = {
+        (int(owner), int(number)): keyframe.T_world_camera
+        for (owner, number), keyframe in zip(merged.provenance["from"], merged.keyframes, strict=True)
+    }
+    robots = []
+    for row in reply.joined:
+        keyframes = versions[row].keyframes
+        moved = move_frames(
+            paths[row],
+            np.array([keyframe.timestamp_s for keyframe in keyframes]),
+            np.array([keyframe.T_world_camera for keyframe in keyframes]),
+            np.array([poses[row, keyframe.id] for keyframe in keyframes]),
+        )
+        robots.append(JoinedRobot(name=names[row], own=paths[row], merged=moved, truth=truths[row]))
+    return robots
+
+
+def move_frames(path: Trajectory, stamps_s: Array, T_before: Array, T_after: Array) -> Trajectory:
+    """Return *path* after its keyframes moved.
+
+    A frame between two keyframes gets their corrections interpolated by time; a frame outside gets that of
+    the nearest keyframe.
+
+    Args:
+        path: ``n`` poses ``T_world_camera``, in the world frame of *T_before*.
+        stamps_s: ``(k,)``, time stamps of the keyframes, ascending.
+        T_before: ``(k, 4, 4)``, poses of the keyframes before.
+        T_after: ``(k, 4, 4)``, poses of the keyframes after, in another world frame.
+    """
+    corrections = T_after @ np.array([inverse(T) for T in T_before])
+    after = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right"), 0, len(stamps_s) - 1)
+    before = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right") - 1, 0, len(stamps_s) - 1)
+    gap_s = stamps_s[after] - stamps_s[before]
+    share = np.clip((path.timestamps_s - stamps_s[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0, 1.0)
+    first, second = (corrections[rows] @ path.T_world_camera for rows in (before, after))
+    mean = (1.0 - share)[:, None, None] * first + share[:, None, None] * second
+    U, _, Vt = np.linalg.svd(mean[:, :3, :3])  # the rotation nearest to the mean of two that are close
+    mean[:, :3, :3] = U @ Vt
+    return Trajectory(path.timestamps_s, mean)
+
+
+def merge_section(
+    names: Sequence[str],
+    robots: Sequence[JoinedRobot],
+    reply: MergeReply,
+    merged: MapVersion,
+    origin: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return ``merged`` of ``report.json``.
+
+    ``ate_cm`` is over all frames of the joined robots after one rigid alignment to the truth.
+    ``ate_before_cm`` aligns every robot by itself, because before the merge their relative poses are unknown:
+    it holds their drift alone.  ``ate_stiff_cm`` moves every map rigidly to where the merge put it.
+    ``origins`` is the error of each robot's first pose relative to the first robot's.
+    """
+    return {
+        "joined": [names[row] for row in reply.joined],
+        "not_joined": [
+            {"robot": names[refusal.map], "reason": refusal.reason} for refusal in reply.not_joined
+        ],
+        "refused": [
+            {"robots": [names[row] for row in refusal.maps], "reason": refusal.reason, "count": refusal.count}
+            for refusal in reply.refused
+        ],
+        "links_between_robots": reply.merges,
+        "loops": reply.loops,
+        "keyframes": len(merged.keyframes),
+        "points": len(merged.points),
+        "frames": sum(len(robot.own) for robot in robots),
+        **_errors(robots),
+        **origin,
+    }
+
+
+def merged_lines(section: Mapping[str, Any]) -> str:
+    """Return the lines that the terminal shows of ``merged``; each ends with a newline."""
+    joined = section["joined"]
+    what = (
+        f"{counted(section['links_between_robots'], 'link')} between them and "
+        f"{counted(section['loops'], 'loop')}"
+        if len(joined) > 1
+        else f"{counted(section['loops'], 'loop')} closed"
+    )
+    lines = [f"merged {', '.join(joined)}: {counted(section['keyframes'], 'keyframe')}, {what}"]
+    if section["ate_cm"] is not None:
+        alone = ", each robot aligned to the truth by itself, which is easier" if len(joined) > 1 else ""
+        together = ", all robots aligned to the truth as one" if len(joined) > 1 else ""
+        lines.append(
+            f"ATE {section['ate_cm']:.2f} cm in the merged map{together} "
+            f"(before: {section['ate_before_cm']:.2f} cm{alone})"
+        )
+    lines += [f"{entry['robot']} not joined: {entry['reason']}" for entry in section["not_joined"]]
+    reasons = Counter[str]()
+    for refusal in section["refused"]:
+        reasons[refusal["reason"]] += refusal["count"]
+    if reasons:
+        counts = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
+        pairs = (
+            "1 pair of keyframes was"
+            if reasons.total() == 1
+            else f"{reasons.total()} pairs of keyframes were"
+        )
+        lines.append(f"{pairs} not linked ({counts})")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def merged_table(section: Mapping[str, Any]) -> list[str]:
+    """Return the table of ``report.md`` about a merged map."""
+    rejected: dict[str, list[str]] = defaultdict(list)
+    for refusal in section["refused"]:
+        first, other = refusal["robots"]
+        pair = f"within {first}" if first == other else f"between {first} and {other}"
+        rejected[pair].append(f"{refusal['count']} {refusal['reason']}")
+    errors = [
+        (what, "-" if section[name] is None else f"{section[name]:.2f}")
+        for what, name in (
+            ("ATE cm", "ate_cm"),
+            ("ATE cm before the merge, each robot aligned to the truth by itself", "ate_before_cm"),
+            ("ATE cm of the maps moved rigidly, not optimised", "ate_stiff_cm"),
+        )
+    ]
+    counts = [str(section[name]) for name in ("keyframes", "links_between_robots", "loops")]
+    rows = [
+        ("joined", ", ".join(section["joined"])),
+        ("not joined", "; ".join(f"{e['robot']}: {e['reason']}" for e in section["not_joined"]) or "-"),
+        ("keyframes / links between robots / loops", " / ".join(counts)),
+        *errors,
+        *((f"error of the origin of {origin['robot']}", f"{origin['cm']:.1f} cm, {origin['deg']:.2f} deg")
+          for origin in section["origins"]),
+        *((f"not linked {pair}", ", ".join(reasons)) for pair, reasons in rejected.items()),
+    ]  # fmt: skip
+    return table(["merged map", ""], rows)
+
+
+def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
+    pairs = [_match_poses(robot) for robot in robots]
+    if not robots or any(pair is None for pair in pairs):
+        return {"ate_cm": None, "ate_before_cm": None, "ate_stiff_cm": None, "origins": []}
+    known = [pair for pair in pairs if pair is not None]
+    together = _residuals(
+        np.concatenate([merged[:, :3, 3] for _, merged, _ in known]),
+        np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
+    )
+    stiff = _residuals(
+        np.concatenate([(_rigid_motion(own, merged) @ own)[:, :3, 3] for own, merged, _ in known]),
+        np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
+    )
+    before = np.concatenate([_residuals(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
+    _, first, first_truth = known[0]
+    origins = []
+    for robot, (_, merged, truth) in zip(robots[1:], known[1:], strict=True):
+        off_m, off_deg = pose_difference(inverse(first[0]) @ merged[0], inverse(first_truth[0]) @ truth[0])
+        origins.append({"robot": robot.name, "cm": round(100 * off_m, 3), "deg": round(off_deg, 3)})
+    return {
+        "ate_cm": round(100 * _rms(together), 4),
+        "ate_before_cm": round(100 * _rms(before), 4),
+        "ate_stiff_cm": round(100 * _rms(stiff), 4),
+        "origins": origins,
+    }
+
+
+def _match_poses(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
+    """Return own, merged and true poses ``(n, 4, 4)`` of the frames whose truth is known."""
+    if robot.truth is None:
+        return None
+    try:
+        rows, true_poses = match_truth(robot.merged, robot.truth)
+    except UsageError:
+        return None
+    return robot.own.T_world_camera[rows], robot.merged.T_world_camera[rows], true_poses
+
+
+def _rigid_motion(own: Array, merged: Array) -> Array:
+    """Return the rigid motion that brings poses ``(n, 4, 4)`` closest: mean rotation, then translation."""
+    U, _, Vt = np.linalg.svd((merged[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2)).sum(axis=0))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[:3, 3] = (merged[:, :3, 3] - own[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
+    return T
+
+
+def _residuals(points: Array, wanted: Array) -> Array:
+    _, T = align(points, wanted)
+    distances: Array = np.linalg.norm(points @ T[:3, :3].T + T[:3, 3] - wanted, axis=1)
+    return distances
+
+
+def _rms(distances: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(distances))))

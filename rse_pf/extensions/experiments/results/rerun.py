@@ -1,0 +1,98 @@
+"""The short form of an experiment, kept in its report: whether today's code still reaches its figures.
+
+A report says with which arguments a short run is made, which figures it must reach, and with how much slack,
+since a short run on another machine is not the same.  Nothing is run here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rse_pf.errors import UsageError
+from rse_pf.extensions.experiments.results.bars import Bars
+
+__all__ = ["RERUN", "FigureReached", "rerun_arguments", "rerun_figures", "rerun_plan"]
+
+RERUN = "rerun"
+"""Name of the plan in a report."""
+_SLACK = 1.5
+_BAR = re.compile(r"(<=|>=) (-?\d+(\.\d+)?(e[-+]?\d+)?)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FigureReached:
+    """One figure of a short run, with what it must be and what the report says."""
+
+    name: str
+    value: Any
+    bar: str
+    reported: Any
+    is_reached: bool
+
+    def __str__(self) -> str:
+        """Return the line as it is printed."""
+        outcome = "reached" if self.is_reached else "MISSED"
+        return (
+            f"{outcome:<7}  {self.name}  {self.value} now, must be {self.bar}; {self.reported} in the report"
+        )
+
+
+def rerun_plan(arguments: Sequence[str], bars: Bars) -> dict[str, Any]:
+    """Return the plan for a report: arguments of ``rse-pf experiment KIND``, and bars of figures."""
+    bar_texts = {name: f"{sense} {bar:g}" for name, (bar, sense) in bars.items()}
+    return {"arguments": list(arguments), "slack": _SLACK, "bars": bar_texts}
+
+
+def rerun_arguments(report: Mapping[str, Any]) -> list[str]:
+    """Return kind and arguments of the short run; raises UsageError for a report without a plan."""
+    plan = report.get(RERUN)
+    arguments = plan.get("arguments") if isinstance(plan, dict) else None
+    if not isinstance(arguments, list) or not all(isinstance(word, str) for word in arguments):
+        raise UsageError("the report has no short form", hint="run the experiment again with this version")
+    return [str(report.get("experiment")), *arguments]
+
+
+def rerun_figures(report: Mapping[str, Any], short: Mapping[str, Any]) -> list[FigureReached]:
+    """Return for each bar of *report* whether the report of the short run reaches it; raises UsageError.
+
+    A figure is named by its path, within ``runs`` if the report has several; of a list, one value for each
+    robot, the largest counts.  A figure that is missing is not reached.
+    """
+    plan = report[RERUN]
+    try:
+        slack, bars = float(plan["slack"]), dict(plan["bars"])
+        limits = {name: _limit(bar, slack) for name, bar in bars.items()}
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(f"the short form in the report is damaged: {error}", hint="restore it") from error
+    return [
+        _check_bar(name, *limit, value=_at(short, name), reported=_at(report, name))
+        for name, limit in limits.items()
+    ]
+
+
+def _limit(bar: str, slack: float) -> tuple[str, float]:
+    match = _BAR.fullmatch(bar)
+    if match is None or slack < 1.0:
+        raise ValueError(f"{bar!r} with slack {slack:g} is no bar")
+    return match[1], float(match[2]) * (slack if match[1] == "<=" else 1.0 / slack)
+
+
+def _check_bar(name: str, sense: str, limit: float, *, value: Any, reported: Any) -> FigureReached:
+    is_reached = value is not None and (value <= limit if sense == "<=" else value >= limit)
+    return FigureReached(
+        name=name, value=value, bar=f"{sense} {limit:g}", reported=reported, is_reached=is_reached
+    )
+
+
+def _at(report: Mapping[str, Any], name: str) -> float | None:
+    """Return the figure at the path *name*; None if there is none."""
+    value: Any = report.get("runs", report)
+    for step in name.split("/"):
+        value = value.get(step) if isinstance(value, Mapping) else None
+    if isinstance(value, list):
+        numbers = [number for number in value if isinstance(number, int | float)]
+        value = max(numbers) if numbers and len(numbers) == len(value) else None
+    return value if isinstance(value, int | float) else None

@@ -1,0 +1,61 @@
+"""The page of the deployment on AWS, on the operator's machine: it shows, and changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from typing import Any
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.overview import read_overview
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, NotFound
+from rse_pf.extensions.fleet_page.app import PageActions
+from rse_pf.extensions.fleet_page.feeds.cloud_feed import CloudFeed
+from rse_pf.extensions.fleet_page.hub import Hub
+from rse_pf.extensions.fleet_page.server import listen, serve_page
+
+__all__ = ["serve_cloud_page"]
+
+
+def serve_cloud_page(
+    account: Account,
+    settings: PlatformSettings,
+    *,
+    port: int,
+    ready: Callable[[str], None],
+) -> int:
+    """Serve the page of the deployment in *account* until a signal; return the exit code.
+
+    Args:
+        account: Of the operator.
+        settings: Of the deployment.
+        port: On loopback; a free one if it is taken or 0.
+        ready: Called with the address that has the key.
+
+    Raises:
+        ConfigurationError: There is no deployment, or AWS refuses these credentials.
+        StoreError: AWS does not answer.
+        MissingExtra: uvicorn is not installed.
+    """
+    first = read_overview(account, settings, now=datetime.now(timezone.utc))
+    hub = Hub()
+    feed = CloudFeed(hub, account, settings, first)
+    return serve_page(
+        hub,
+        PageActions(operate=_operate, page=_page),
+        listening=listen(port),
+        works=lambda: [feed.run()],
+        platform=None,
+        ready=ready,
+    )
+
+
+async def _operate(action: str, parameters: Mapping[str, str]) -> Mapping[str, Any]:
+    raise BadRequest("this page only shows the deployment", hint="see docs/operations.md")
+
+
+async def _page(name: str, query: Mapping[str, str]) -> tuple[str, bytes]:
+    if name == "maps":
+        return "application/json", b"[]"
+    raise NotFound("maps and recordings of the deployment are not shown here", hint="see docs/operations.md")

@@ -1,0 +1,338 @@
+"""What the page knows of the deployment on AWS: read with the operator's credentials, while somebody looks.
+
+Nothing is changed in the account, and no port of it is opened.  What AWS does not tell is said in words.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from datetime import datetime, timezone
+from typing import Any, TypeVar
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.group import AutoScalingGroup, Server
+from rse_pf.aws.fleet.group_metrics import GroupMetrics, read_group_metrics
+from rse_pf.aws.fleet.overview import CloudOverview, ScalingActivity, read_overview
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
+from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
+from rse_pf.extensions.fleet_page.hub import Hub
+from rse_pf.local.together import run_together
+from rse_pf.terminal import printable
+
+__all__ = ["CloudFeed", "cloud_document", "new_events"]
+
+_STATE_EVERY_S = 10.0
+_TELL_EVERY_S = 3.0
+_LOOK_S = 0.25
+_MAX_TEXT = 300
+_LATE_PERIODS = 2
+_NOT_UNDERSTOOD = (LookupError, TypeError, ValueError)
+_NOT_TOLD = (
+    "Commands, queue and wait are published for the whole group, not for each server",
+    "robots are counted, not named; weak poses, events of the servers and live maps stay on the servers",
+    "audit entries: rse-pf audit show --cloud",
+)
+_STATES = {"InService": "starting", "Pending": "starting", "Terminating": "draining", "Terminated": "gone"}
+
+T = TypeVar("T")
+
+
+class CloudFeed:
+    """Feeds a `Hub` with what one deployment does."""
+
+    def __init__(
+        self,
+        hub: Hub,
+        account: Account,
+        settings: PlatformSettings,
+        first: CloudOverview,
+        *,
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            hub: What is told.
+            account: Whose deployment.
+            settings: Of the platform.
+            first: The state that was read before, to see whether the credentials are good.
+            wall_clock: Unix seconds.
+        """
+        self._hub = hub
+        self._account = account
+        self._settings = settings
+        self._wall_clock = wall_clock
+        self._overview = first
+        self._metrics = GroupMetrics(period_s=settings.scaling.period_s)
+        self._problems: dict[str, str] = {}
+        for event in new_events(None, first, time_s=wall_clock()):
+            hub.append("event", event)
+
+    async def run(self) -> None:
+        """Feed until cancelled, at first with the state that was read before."""
+        self._publish()
+        works: list[Coroutine[Any, Any, None]] = [
+            self._repeat(_STATE_EVERY_S, self._read_state),
+            self._repeat(float(self._settings.scaling.period_s), self._read_metrics),
+            self._publish_periodically(),
+        ]
+        await run_together(*works)
+
+    async def _repeat(self, every_s: float, read: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        while True:
+            while not self._hub.watches("fleet"):
+                await asyncio.sleep(_LOOK_S)
+            await read()
+            self._publish()
+            await asyncio.sleep(every_s)
+
+    async def _publish_periodically(self) -> None:
+        while True:
+            self._publish_link()
+            await asyncio.sleep(_TELL_EVERY_S)
+
+    async def _read_state(self) -> None:
+        now = self._now()
+        read = await self._read_in_thread(
+            "state", lambda: read_overview(self._account, self._settings, now=now)
+        )
+        if read is not None:
+            for event in new_events(self._overview, read, time_s=now.timestamp()):
+                self._hub.append("event", event)
+            self._overview = read
+
+    async def _read_metrics(self) -> None:
+        names, now = [server.name for server in self._overview.group.servers], self._now()
+        read = await self._read_in_thread(
+            "metrics", lambda: read_group_metrics(self._account, self._settings, names, now=now)
+        )
+        if read is not None:
+            self._metrics = read
+            self._hub.put("history", "minutes", _history(read))
+
+    async def _read_in_thread(self, subject: str, read: Callable[[], T]) -> T | None:
+        """Return what *read* returns in a thread; None, and a problem under *subject*, when AWS refuses."""
+        try:
+            value = await asyncio.to_thread(read)
+        except RsePfError as error:
+            self._problems[subject] = f"{error.message} ({error.hint})"
+            return None
+        except _NOT_UNDERSTOOD as error:  # the page shows what the other answers say
+            self._problems[subject] = f"AWS answers in a way that is not understood: {error}"
+            return None
+        self._problems.pop(subject, None)
+        return value
+
+    def _publish(self) -> None:
+        unread = (text for subject, text in self._problems.items() if subject != "state")
+        overview = replace(self._overview, problems=(*self._overview.problems, *unread))
+        document = cloud_document(
+            overview, self._metrics, self._settings, time_s=self._wall_clock(),
+            region=self._account.region,
+        )  # fmt: skip
+        document["pages"] = self._hub.pages
+        self._hub.put("fleet", "now", document)
+        self._publish_link()
+
+    def _publish_link(self) -> None:
+        wrong = self._problems.get("state")
+        link = {"connected": wrong is None, "time_s": self._wall_clock()}
+        self._hub.put("link", "control_plane", {**link, **({"text": printable(wrong)} if wrong else {})})
+
+    def _now(self) -> datetime:
+        return datetime.fromtimestamp(self._wall_clock(), timezone.utc)
+
+
+def cloud_document(
+    overview: CloudOverview,
+    metrics: GroupMetrics,
+    settings: PlatformSettings,
+    *,
+    time_s: float,
+    region: str = "",
+) -> dict[str, Any]:
+    """Return what the Fleet view shows of a deployment, every text escaped; what is unknown is None.
+
+    Args:
+        overview: Its state.
+        metrics: Its numbers.
+        settings: Of the platform.
+        time_s: Unix seconds.
+        region: Of the deployment.
+    """
+    group, balancer, period_s = overview.group, overview.balancer, metrics.period_s
+    servers = [_server(server, overview, metrics, time_s) for server in group.servers]
+    robots = [server["robots"] for server in servers if server["robots"] is not None]
+    answers = metrics.newest("answers")
+    percentiles = {name: _round(metrics.newest(name), 1) for name in ("p50_ms", "p95_ms", "p99_ms")}
+    per_s = {
+        name: _round(_divide(metrics.newest(name), period_s), 2)
+        for name in ("requests", "bytes_in", "bytes_out")
+    }
+    unknown = [*_NOT_TOLD, *overview.problems]
+    if len(robots) < len(servers):
+        unknown.insert(0, f"{len(servers) - len(robots)} of {len(servers)} servers did not tell their robots")
+    return {
+        "time_s": time_s,
+        "cloud": True,
+        "platform": printable(f"on AWS, {region}"),
+        "url": printable("" if balancer is None else balancer.address),
+        "tls": balancer is not None and bool(balancer.protocols) and set(balancer.protocols) <= _SECURE,
+        "protocols": [] if balancer is None else [printable(protocol) for protocol in balancer.protocols],
+        "balancer": balancer is not None and balancer.state in ("active", "active_impaired"),
+        "balancer_state": printable("not known" if balancer is None else balancer.state),
+        "robots": sum(robots) if robots else None,
+        "cpu_percent": _round(metrics.newest("cpu_percent"), 1),
+        "queue_ms": _round(metrics.newest("queue_ms"), 1),
+        **per_s,
+        "servers": servers,
+        "data_servers": [],
+        "waiting": _list_wait_reasons(group, metrics, settings),
+        "last_action": printable(overview.activities[-1].text[:_MAX_TEXT]) if overview.activities else "",
+        "min_servers": group.min_servers,
+        "max_servers": group.max_servers,
+        "wanted_servers": group.wanted_servers,
+        "busy_percent": settings.scaling.busy_cpu_percent,
+        "period_s": period_s,
+        "percentiles": {"count": round(answers), "covered_s": period_s, **percentiles} if answers else {},
+        "alarms": [
+            {"name": printable(name), "state": printable(state)}
+            for name, state in sorted(group.alarms.items())
+        ],
+        "unknown": [printable(text) for text in unknown],
+    }
+
+
+def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: float) -> list[dict[str, Any]]:
+    """Return what happened between two looks, as the Events view shows it; all that is known at the first."""
+    old_activities = (
+        set() if before is None else {(activity.id, activity.status) for activity in before.activities}
+    )
+    events = [
+        _activity(activity)
+        for activity in after.activities
+        if (activity.id, activity.status) not in old_activities
+    ]
+    old_alarms = {} if before is None else before.group.alarms
+    for name, state in sorted(after.group.alarms.items()):
+        if state != old_alarms.get(name) and (before is not None or state == "ALARM"):
+            reason = after.group.reasons.get(name, "")
+            events.append(
+                _event(
+                    time_s, f"alarm-{name}", f"alarm {name} is in state {state}: {reason}",
+                    group="trouble" if state == "ALARM" and name not in _SCALES else "scaling",
+                )
+            )  # fmt: skip
+    if before is not None:
+        events += _changes(before.group, after.group, time_s)
+    return events
+
+
+_SECURE = {"TLS", "HTTPS"}
+_SCALES = ("busy", "idle", "crowded", "queueing")
+
+
+def _changes(before: AutoScalingGroup, after: AutoScalingGroup, time_s: float) -> list[dict[str, Any]]:
+    old_states = {server.name: _state(server) for server in before.servers}
+    changes = []
+    for server in after.servers:
+        state = _state(server)
+        if old_states.get(server.name) != state:
+            health = ", ".join(server.targets) or "in no target group"
+            text = f"{server.name} is {state} ({server.state}; {health})"
+            group = "trouble" if state == "unhealthy" else "other"
+            changes.append(_event(time_s, f"server-{state}", text, group=group, server=server.name))
+    for name in sorted(old_states.keys() - {server.name for server in after.servers}):
+        changes.append(
+            _event(time_s, "server-gone", f"{name} has left the group", group="other", server=name)
+        )
+    return changes
+
+
+def _activity(activity: ScalingActivity) -> dict[str, Any]:
+    text = f"{activity.text} {activity.status}. {activity.cause}".strip()
+    group = "trouble" if activity.has_failed else "scaling"
+    return _event(activity.began_s, "group-activity", text, group=group)
+
+
+def _event(time_s: float, kind: str, text: str, *, group: str, server: str = "") -> dict[str, Any]:
+    return {
+        "time_s": time_s, "kind": printable(kind), "text": printable(text[:_MAX_TEXT]),
+        "server": printable(server), "group": group,
+    }  # fmt: skip
+
+
+def _server(server: Server, overview: CloudOverview, metrics: GroupMetrics, time_s: float) -> dict[str, Any]:
+    numbers = metrics.servers.get(server.name, {})
+    launched_s = overview.launched_s.get(server.name)
+    robots = numbers.get("robots")
+    return {
+        "name": printable(server.name),
+        "state": printable(_state(server)),
+        "note": printable(f"{server.state}, {server.zone}; targets: {', '.join(server.targets) or 'none'}"),
+        "cpu_percent": _round(numbers.get("cpu_percent"), 1),
+        "robots": None if robots is None else round(robots),
+        "requests": None, "queue": None, "queue_ms": None, "in_flight": None, "pid": None, "warming": False,
+        "age_s": None if launched_s is None else round(max(time_s - launched_s, 0.0), 1),
+    }  # fmt: skip
+
+
+def _state(server: Server) -> str:
+    """Return the state of a server in the words of the local platform."""
+    phase = server.state.partition(":")[0]
+    if phase != "InService":
+        return _STATES.get(phase, server.state)
+    if set(server.targets) == {"healthy"}:
+        return "healthy"
+    return "unhealthy" if {"unhealthy", "draining", "unused"} & set(server.targets) else "starting"
+
+
+def _list_wait_reasons(
+    group: AutoScalingGroup, metrics: GroupMetrics, settings: PlatformSettings
+) -> list[str]:
+    """Return what the alarms wait for: they are the same policy as that of a local platform."""
+    pairs = list(zip(metrics.series.get("cpu_percent", ()), metrics.series.get("requests", ()), strict=False))
+    while pairs and pairs[-1][0] is None and len(metrics.times_s) - len(pairs) < _LATE_PERIODS:
+        pairs.pop()  # it comes a minute or two late
+    samples: list[dict[str, float]] = []
+    for cpu, requests in pairs:
+        # A period without a number breaches no alarm, so that the count begins anew.
+        samples = [] if cpu is None else [*samples, {"cpu_percent": cpu, "requests": requests or 0.0}]
+    policy = {
+        "elastic": True, "samples": samples,
+        "min_servers": group.min_servers, "max_servers": group.max_servers,
+    }  # fmt: skip
+    reasons = waiting_for(policy, settings.scaling, servers=len(group.servers))
+    if group.wanted_servers != len(group.servers):
+        reasons.insert(0, f"the group wants {group.wanted_servers} servers and has {len(group.servers)}")
+    for name, state in sorted(group.alarms.items()):
+        if state == "ALARM":
+            text = f"alarm {name} is in state ALARM: {group.reasons.get(name, '')}"
+            reasons.append(f"{text[:_MAX_TEXT]} (docs/operations.md#{name})")
+    return [printable(reason) for reason in reasons]
+
+
+def _history(metrics: GroupMetrics) -> list[list[float | None]]:
+    """Return time, CPU, commands a second, robots and p99 of each period; robots are not charted."""
+    series, count = metrics.series, len(metrics.times_s)
+    nothing: tuple[float | None, ...] = (None,) * count
+    rates = [_round(_divide(count, metrics.period_s), 2) for count in series.get("requests", nothing)]
+    return [
+        [float(time_s) for time_s in metrics.times_s],
+        list(series.get("cpu_percent", nothing)),
+        rates,
+        list(nothing),
+        list(series.get("p99_ms", nothing)),
+    ]
+
+
+def _divide(value: float | None, by: float) -> float | None:
+    return None if value is None else value / by
+
+
+def _round(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

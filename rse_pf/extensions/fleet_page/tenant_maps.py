@@ -1,0 +1,44 @@
+"""The maps of all tenants of one local platform, each under one label: NAME, or TENANT/NAME.
+
+The label of a map of the default tenant is its name.  Tenants whose names are no plain folder are left out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rse_pf.aws.storage import open_data_store
+from rse_pf.config import PlatformSettings
+from rse_pf.identity import DEFAULT_TENANT, name_segment
+from rse_pf.local.servers.backend_servers import local_placement
+from rse_pf.local.state import platform_settings
+from rse_pf.storage.object_store import ObjectStore
+
+__all__ = ["map_label", "platform_store", "split_label", "tenants_with"]
+
+# Tenants whose maps are shown, besides the default one: the page has one connection for each.
+_MAX_TENANTS = 32
+
+
+def platform_store(folder: Path) -> ObjectStore:
+    """Return the object store of the platform whose state is in *folder*."""
+    settings = platform_settings(folder) or PlatformSettings()
+    store = local_placement(settings, folder).store
+    return open_data_store(settings.replace(data={"store": store}))
+
+
+def tenants_with(store: ObjectStore, kind: str) -> list[str]:
+    """Return the default tenant, and the others that have something in the folder *kind*.  Blocking."""
+    others = sorted(set(store.folders(f"{kind}/")) - {DEFAULT_TENANT})
+    return [DEFAULT_TENANT, *[each for each in others if name_segment(each) == each][:_MAX_TENANTS]]
+
+
+def map_label(tenant: str, name: str) -> str:
+    """Return the label of the map *name*."""
+    return name if tenant == DEFAULT_TENANT else f"{tenant}/{name}"
+
+
+def split_label(label: str) -> tuple[str, str]:
+    """Return tenant and name of a map; no name of a map has a slash."""
+    tenant, _, name = label.rpartition("/")
+    return tenant or DEFAULT_TENANT, name

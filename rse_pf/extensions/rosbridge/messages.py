@@ -1,0 +1,198 @@
+"""Read the operations of rosbridge v2, and write what clients are answered.
+
+The message of a ``publish`` is checked and passed on as its text; no object is made of it.
+
+Source:
+    The rosbridge v2.0 protocol specification, RobotWebTools/rosbridge_suite, ROSBRIDGE_PROTOCOL.md.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import msgspec
+
+from rse_pf.errors import BadMessage, RsePfError, UnsupportedProtocol
+from rse_pf.limits.budget import Budget, check_json, check_size
+from rse_pf.wire import arrays
+
+__all__ = ["Head", "Operation", "publication", "read_head", "read_operation", "refusal", "response"]
+
+OPS = frozenset(
+    (
+        "auth", "call_service", "advertise", "unadvertise", "publish", "subscribe", "unsubscribe",
+        "set_level", "status",
+    )
+)  # fmt: skip
+_UNSUPPORTED = {
+    "png": "PNG compression is",
+    "cbor": "CBOR is",
+    "cbor-raw": "CBOR is",
+    "fragment": "fragments are",
+    "advertise_service": "services of robots are",
+    "unadvertise_service": "services of robots are",
+    "service_response": "services of robots are",
+}
+_PAGE = "compare it with docs/rosbridge.md"
+
+Name = Annotated[str, msgspec.Meta(max_length=256)]
+Identity = Annotated[str, msgspec.Meta(max_length=256)] | int | None
+
+
+class Head(msgspec.Struct, frozen=True):
+    """What a refusal names of a message: its operation, its id, and the service of a call."""
+
+    op: Any = None
+    id: Any = None
+    service: Any = None
+
+
+class Operation(msgspec.Struct, frozen=True):
+    """Every field of every operation that is read; the others are ignored."""
+
+    op: Name
+    id: Identity = None
+    service: Name = ""
+    args: msgspec.Raw = msgspec.Raw()
+    timeout: float | None = None
+    topic: Name = ""
+    type: Name | None = None
+    msg: msgspec.Raw = msgspec.Raw()
+    latch: bool | None = None
+    throttle_rate: float | None = None
+    queue_length: int | None = None
+    compression: Name | None = None
+    mac: Annotated[str, msgspec.Meta(max_length=65536)] = ""
+    level: Any = None
+
+
+class _Response(msgspec.Struct, frozen=True, omit_defaults=True):
+    op: str
+    service: str
+    values: Any
+    result: bool
+    id: str | int | None = None
+
+
+class _Status(msgspec.Struct, frozen=True, omit_defaults=True):
+    op: str
+    level: str
+    msg: str
+    id: str | int | None = None
+    code: str = ""
+    hint: str = ""
+    retry_after_ms: float | None = None
+
+
+class _Publication(msgspec.Struct, frozen=True):
+    op: str
+    topic: str
+    msg: msgspec.Raw
+
+
+_encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
+_decode = msgspec.json.Decoder(Operation).decode
+_UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError)
+_UNENCODABLE = (RecursionError, ValueError, TypeError, OverflowError)
+
+
+def read_operation(data: bytes, budget: Budget) -> Operation:
+    """Return the operation in one message.
+
+    NaN and Infinity, which are no JSON but which Python programs write, become null in messages of topics, as
+    rosbridge_suite sends them; the arguments of a service must be finite.
+
+    Raises:
+        ProtocolError: It is no operation that is supported here, or exceeds *budget*.
+    """
+    check_size(data, budget)
+    try:
+        operation = _decode(data)
+        data.decode()  # what is passed on is text
+    except msgspec.ValidationError as error:
+        raise BadMessage(str(error)[:200], hint=_PAGE) from error
+    except _UNDECODABLE as error:
+        operation = _read_not_finite(data, budget, error)
+    if operation.op in _UNSUPPORTED:
+        raise UnsupportedProtocol(
+            f"{_UNSUPPORTED[operation.op]} not supported here", hint="see docs/rosbridge.md, what is refused"
+        )
+    if operation.op not in OPS:
+        raise BadMessage(f"op {operation.op[:40]!r} is unknown", hint=_PAGE)
+    if operation.op == "publish":
+        if not bytes(operation.msg):
+            raise BadMessage("a publish has no msg", hint="send op, topic and msg")
+        check_json(bytes(operation.msg), budget)
+    elif operation.op == "call_service":
+        check_json(bytes(operation.args), budget)
+    return operation
+
+
+def _read_not_finite(data: bytes, budget: Budget, error: Exception) -> Operation:
+    """Return the operation in *data*, which *error* says is no JSON, if NaN and Infinity are the reason."""
+    malformed = BadMessage(
+        f"not a message of rosbridge: {str(error)[:150]}", hint="send JSON as text, not CBOR"
+    )
+    check_json(data, budget)
+    not_finite: list[str] = []
+    try:
+        value = json.loads(data, parse_constant=not_finite.append)  # which returns None: null
+        operation = _decode(json.dumps(value, allow_nan=False))
+    except _UNDECODABLE:
+        raise malformed from error
+    if not not_finite:
+        raise malformed from error
+    if operation.op == "call_service":
+        raise BadMessage(
+            f"the arguments of a service hold {not_finite[0]}", hint="send finite numbers, or null"
+        )
+    return operation
+
+
+def read_head(data: bytes) -> Head:
+    """Return what can be read of a message that was refused, for the answer; nothing of malformed JSON."""
+    try:
+        head = msgspec.convert(json.loads(data), Head)
+    except _UNDECODABLE:
+        return Head()
+    is_id = isinstance(head.id, int) or (_is_text(head.id) and len(head.id) <= 256)
+    service = head.service if _is_text(head.service) else ""
+    return Head(head.op, head.id if is_id else None, service[:256])
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether *value* is a text that can be sent; one with a lone surrogate cannot."""
+    try:
+        return isinstance(value, str) and value.encode() is not None
+    except UnicodeEncodeError:
+        return False
+
+
+def publication(topic: str, message: bytes) -> bytes:
+    """Return the text that brings the JSON *message* to a subscriber of *topic*."""
+    return _encode(_Publication("publish", topic, msgspec.Raw(message)))
+
+
+def response(call: Operation | Head, values: Any, *, is_result: bool = True) -> bytes:
+    """Return the answer *values* to a call.
+
+    Raises:
+        BadMessage: They cannot be written as JSON.
+    """
+    try:
+        return _encode(_Response("service_response", call.service, values, is_result, call.id))
+    except _UNENCODABLE as error:
+        raise BadMessage(
+            f"a reply cannot be encoded: {str(error)[:150]}", hint="ask with a client of the platform"
+        ) from error
+
+
+def refusal(of: Operation | Head, error: RsePfError) -> bytes:
+    """Return the answer to a call that failed by *error*, or the status about another operation."""
+    named = {"code": error.code, "message": error.message, "hint": error.hint}
+    if of.op == "call_service":
+        return response(of, {**named, "retry_after_ms": error.retry_after_ms}, is_result=False)
+    hint = f"; {error.hint}" if error.hint else ""
+    text = f"{error.code}: {error.message}{hint}"
+    return _encode(_Status("status", "error", text, of.id, error.code, error.hint, error.retry_after_ms))

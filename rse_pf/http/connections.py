@@ -1,0 +1,245 @@
+"""HTTP/1.1 for services on uvicorn: one request at a time, with one meaning, and bounded connections.
+
+uvicorn's `HttpToolsProtocol` reads requests with llhttp.  By itself it waits for ever for the end of a head,
+has no bound on the size of a head, and accepts a request before it has answered the one before.
+`OneRequestProtocol` has these bounds, and refuses whatever two readers could understand differently (request
+smuggling).
+
+Source:
+    RFC 9112, sections 2.2, 3, 5, 6 and 7.1.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import re
+from typing import Any
+
+from rse_pf.errors import MissingExtra
+from rse_pf.http.unauthenticated import FIRST_REQUEST_S, KEEP_ALIVE_S, MAX_SILENT, SilentConnections
+
+_missing: ImportError | None = None
+try:
+    import httptools
+    from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+except ImportError as error:  # as on a robot, which serves nothing: `bounded_protocol` reports it
+    HttpToolsProtocol, _missing = object, error  # type: ignore[assignment, misc]
+
+__all__ = ["MAX_HEADERS", "MAX_HEAD_BYTES", "OneRequestProtocol", "bounded_protocol"]
+
+MAX_HEAD_BYTES = 16384  # of one request: a token, the longest header, has at most 4 KiB
+MAX_HEADERS = 64  # of one request: browsers and load balancers send fewer than 30
+# A chunked body may be longer than its data by these bytes and an eighth: each chunk costs CPU.
+MAX_FRAMING_BYTES = 4096
+FRAMING_SHIFT = 3
+PARSED_AT_ONCE_BYTES = 16384  # bytes of a chunked body between two checks of its framing
+UNSENT_HIGH_BYTES = 1 << 19  # of a reply: the application waits for a client that has not read so many
+UNSENT_LOW_BYTES = 1 << 18  # of a reply: the application goes on when no more than these wait
+_END_OF_HEAD = b"\r\n\r\n"
+_HEAD = re.compile(
+    rb"[A-Z]{1,16} /[!\"$-~]* HTTP/1\.1\r\n"  # no fragment: readers differ in what they do with "#"
+    rb"(?:[-!#$%&'*+.^_`|~0-9A-Za-z]+:[\t -~\x80-\xff]*\r\n){1," + b"%d" % MAX_HEADERS + rb"}\r\n"
+)
+
+
+def bounded_protocol(
+    *,
+    seconds: float = FIRST_REQUEST_S,
+    idle_s: float = KEEP_ALIVE_S,
+    most: int = MAX_SILENT,
+    most_idle: int,
+    ends_with_client: bool = False,
+) -> Any:
+    """Return what uvicorn calls to make the protocol of each connection of one listener.
+
+    Args:
+        seconds: Time for the head of a request, from the connection or from the head's first byte.
+        idle_s: Time between an answer and the next request.
+        most: Connections that have sent no whole head; above that the oldest is cut.
+        most_idle: Connections that were answered and wait; above that the one that waited longest is closed.
+        ends_with_client: Cancel the application when the client is gone.
+
+    Raises:
+        MissingExtra: uvicorn or httptools is not installed.
+    """
+    if _missing is not None:
+        raise MissingExtra(_missing.name or "uvicorn", "backend") from _missing
+    silent: SilentConnections[object] = SilentConnections(call_later=_call_later, seconds=seconds, most=most)
+    idle: SilentConnections[object] = SilentConnections(
+        call_later=_call_later, seconds=idle_s, most=most_idle
+    )
+    return functools.partial(OneRequestProtocol, silent, idle, ends_with_client)
+
+
+class OneRequestProtocol(HttpToolsProtocol):
+    """A connection that carries one request after the other, each after the reply to the one before.
+
+    Load balancers and our own clients wait for a reply before they send the next request.  What comes earlier
+    is never taken for a request: the present one is answered, then the connection is closed.
+    """
+
+    def __init__(
+        self,
+        silent: SilentConnections[object],
+        idle: SilentConnections[object],
+        ends_with_client: bool,
+        *args: Any,
+        **kwargs: Any,
+    ) -> None:
+        """Make the protocol; the other arguments are those that uvicorn gives to `HttpToolsProtocol`."""
+        super().__init__(*args, **kwargs)
+        self._silent, self._idle, self._ends_with_client = silent, idle, ends_with_client
+        self._served, self.app = self.app, self._serve
+        self._task: asyncio.Task[Any] | None = None
+        self._head = b""  # what has come of a head that is not complete
+        self._has_head = False
+        self._is_chunked = False
+        self._framing_bytes_left = 0
+
+    # --- called by the transport ---------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Count the connection as one that has sent nothing."""
+        super().connection_made(transport)
+        transport.set_write_buffer_limits(UNSENT_HIGH_BYTES, UNSENT_LOW_BYTES)
+        self._silent.enter(self, transport.abort)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Report to the application that its client is gone."""
+        self._silent.leave(self)
+        self._idle.leave(self)
+        super().connection_lost(exc)
+        self.app = self._served  # no reference to itself is left, which would keep it in memory
+        if self._ends_with_client and self._task is not None and not self.cycle.response_complete:
+            self._task.cancel()
+
+    def data_received(self, data: bytes) -> None:
+        """Take a part of a head, a part of a body, or what no client sends that waits for its reply."""
+        if self.transport.is_closing():
+            return
+        if self._is_in_request():
+            self._parse_body(data)
+            return
+        searched = max(0, len(self._head) - len(_END_OF_HEAD) + 1)
+        data = self._head + data
+        end = data.find(_END_OF_HEAD, searched, MAX_HEAD_BYTES) + len(_END_OF_HEAD)
+        if end < len(_END_OF_HEAD):
+            self._head = data
+            if len(data) >= MAX_HEAD_BYTES or not data[:1].isupper():
+                self._refuse()
+            else:  # the time for the whole head begins with its first byte
+                self._idle.leave(self)
+                self._silent.enter(self, self.transport.abort)
+            return
+        self._head = b""
+        head, body = data[:end], data[end:]
+        if not _HEAD.fullmatch(head):
+            self._refuse()
+            return
+        self._silent.leave(self)
+        self._idle.leave(self)
+        self._parse(head)
+        self._parse_body(body)
+
+    # --- called by llhttp; what is raised ends the parsing, and `_parse` refuses the request -----------
+
+    def on_message_begin(self) -> None:
+        """Begin a request, unless one is being answered."""
+        if self._is_in_request():
+            raise ValueError("a request came before the reply to the one before")
+        super().on_message_begin()
+        self._has_head = False
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Take a header of the head; a trailer of a chunked body must not become one."""
+        if self._has_head:
+            raise ValueError("a trailer")
+        super().on_header(name, value.rstrip(b" \t"))  # which llhttp leaves there
+
+    def on_headers_complete(self) -> None:
+        """Start the application if the head has one host, at most one length of its body, and no upgrade."""
+        hosts = sum(name == b"host" for name, _ in self.headers)
+        lengths = [each for each in self.headers if each[0] in (b"content-length", b"transfer-encoding")]
+        self._is_chunked = [each[0] for each in lengths] == [b"transfer-encoding"]
+        if hosts != 1 or len(lengths) > 1 or self.parser.should_upgrade():
+            raise ValueError("a head with two meanings")
+        if self._is_chunked and lengths[0][1].lower() != b"chunked":
+            raise ValueError("an unknown coding")
+        self._has_head, self._framing_bytes_left = True, MAX_FRAMING_BYTES
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        """Take a part of a body, which pays for its framing."""
+        self._framing_bytes_left += len(body) + (len(body) >> FRAMING_SHIFT)
+        super().on_body(body)
+
+    # --- called by uvicorn ---------------------------------------------------------------------------
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request, or close the connection if the present one was not read to its end."""
+        self.server_state.total_requests += 1
+        if self.cycle.more_body:
+            self.transport.close()
+        if not self.transport.is_closing():
+            self.flow.resume_reading()
+            self._idle.enter(self, self.transport.close)
+
+    # -------------------------------------------------------------------------------------------------
+
+    def _is_in_request(self) -> bool:
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _parse_body(self, data: bytes) -> None:
+        """Parse what follows a head, and bound its framing."""
+        step = PARSED_AT_ONCE_BYTES if self._is_chunked else max(len(data), 1)
+        for start in range(0, len(data), step):
+            if self.transport.is_closing():
+                return
+            if not self.cycle.more_body:
+                self._close_after_reply()
+                return
+            part = data[start : start + step]
+            self._framing_bytes_left -= len(part)
+            self._parse(part)
+            if self._is_chunked and self._framing_bytes_left < 0 and self.cycle.more_body:
+                self._refuse()
+
+    def _parse(self, data: bytes) -> None:
+        try:
+            self.parser.feed_data(data)
+        except httptools.HttpParserError:
+            if self._is_in_request() and not self.cycle.more_body:
+                self._close_after_reply()
+            else:
+                self._refuse()
+
+    def _close_after_reply(self) -> None:
+        self.cycle.keep_alive = False
+        self.flow.pause_reading()
+
+    def _refuse(self) -> None:
+        """Answer 400 unless a reply has begun, and close the connection."""
+        if self.transport.is_closing():
+            return
+        has_begun = False
+        if self._is_in_request():
+            has_begun = self.cycle.response_started
+            self.cycle.disconnected = True  # so that nothing more is sent
+            self.cycle.message_event.set()
+        if has_begun:
+            self.transport.close()
+        else:
+            self.send_400_response("Invalid HTTP request received.")
+
+    async def _serve(self, scope: Any, receive: Any, send: Any) -> None:
+        """Run the application; `connection_lost` may cancel it, which is no error."""
+        self._task = asyncio.current_task()
+        if not self.cycle.disconnected:
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._served(scope, receive, send)
+
+
+def _call_later(*args: Any) -> asyncio.TimerHandle:
+    return asyncio.get_running_loop().call_later(*args)

@@ -1,0 +1,527 @@
+"""Run a function over a stranger's bytes in processes that have limits and are killed at a timeout.
+
+    with LimitedProcesses("rse_pf.maps.describe:describer", ProcessLimits(memory_bytes=1 << 28)) as processes:
+        description = processes.call(data, timeout_s=5.0)
+
+``describer`` is called once, in a template process that has one thread, with the configuration; it imports
+what the work needs and returns a function from bytes to bytes.  Each process is forked from the template and
+answers one call after the other, so what that function caches stays until its process is killed.  A process
+that was killed is replaced in some milliseconds.  `LimitedProcesses.call` blocks and may be called by several
+threads.
+
+Bytes that crash their process, exhaust its memory or its CPU time cost that one process and nothing else, and
+only they raise Crashed: it is evidence against the sender of the bytes, the other errors are not.  This is no
+sandbox: code that took over the process may do what its user may do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from rse_pf.errors import (
+    Busy,
+    Crashed,
+    Expired,
+    InternalError,
+    RsePfError,
+    WorkerLost,
+    error_from_code,
+)
+from rse_pf.processes.fork_server import ForkPlan, read_packet, send_order, serve_forks, start_fork_server
+from rse_pf.processes.ipc import receive_bytes
+from rse_pf.processes.linux import be_killed_first, close_other_descriptors, die_with_parent, limit_memory
+from rse_pf.processes.start import Child, ChildPlan, how_ended
+
+__all__ = [
+    "DEFAULT_NICENESS",
+    "Handler",
+    "LimitedProcesses",
+    "Overran",
+    "ProcessLimits",
+    "limit_cpu",
+    "run",
+]
+
+Handler = Callable[[bytes], bytes]
+"""What answers a call; raises MemoryError, or an `RsePfError` that the caller is to see."""
+
+DEFAULT_NICENESS = 5
+_MAX_REPLY_BYTES = 1 << 20
+_ORDER_TIMEOUT_S = 10.0
+"""A template that does not fork or kill a process within this is replaced."""
+_BUSY_RETRY_MS = 1000.0
+_NEAR = 4
+"""Kinds of work that a process is remembered for."""
+_OUT_OF_MEMORY = 77
+"""Exit code of a process whose handler raised MemoryError."""
+_NO_MEMORY, _NO_TIME = how_ended(_OUT_OF_MEMORY), how_ended(-signal.SIGPROF)
+"""How a process ends by its limits; it arms the signal before each call."""
+_LENGTH = struct.Struct("<Q")
+_REPLY = struct.Struct("<BQd")
+"""Kind and length of what follows, and the CPU seconds of the process so far."""
+_DONE, _REFUSED, _DEFECT = 0, 1, 2
+
+
+class Overran(Expired):
+    """The timeout passed during the work, which had taken ``cpu_s`` seconds of CPU time, and was killed."""
+
+    def __init__(self, timeout_s: float, cpu_s: float) -> None:
+        super().__init__(f"the work took longer than {timeout_s:.3g} s and was ended", hint="allow more time")
+        self.cpu_s = cpu_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessLimits:
+    """What one process may use."""
+
+    memory_bytes: int
+    """What calls may allocate, beside what the template has allocated."""
+    cpu_s: float = 60.0
+    """CPU seconds of one call, however busy the machine is; its handler may allow less by `limit_cpu`."""
+    max_reply_bytes: int = _MAX_REPLY_BYTES
+    """A process that replies with more has failed."""
+
+
+class LimitedProcesses:
+    """Up to *count* processes that answer calls; nothing is started before the first call."""
+
+    def __init__(
+        self,
+        target: str,
+        limits: ProcessLimits,
+        *,
+        configuration: str = "",
+        count: int = 1,
+        niceness: int = DEFAULT_NICENESS,
+    ) -> None:
+        """Say what is run and within which limits.
+
+        Args:
+            target: ``module:function``; the function takes *configuration* and returns a `Handler`.
+            limits: What one process may use.
+            configuration: Text for *target*, such as settings in JSON; at most 100 kB.
+            count: Processes that work at the same time; further calls wait for one of them.
+            niceness: Of the processes, above that of this process.
+        """
+        order = {
+            "target": target, "configuration": configuration, "limits": [limits.memory_bytes, limits.cpu_s]
+        }  # fmt: skip
+        self._memory_bytes = limits.memory_bytes
+        self._max_reply_bytes = limits.max_reply_bytes
+        self._template = _Template(order, niceness)
+        self._free = _FreeSlots(count)
+
+    def __enter__(self) -> LimitedProcesses:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def call(
+        self, data: bytes, timeout_s: float, *, near: str = "", charge: Callable[[float], None] | None = None
+    ) -> bytes:
+        """Return the handler's reply to *data*; blocks for at most *timeout_s* seconds, and some ms.
+
+        A call whose process ends, although it had answered other calls before, is repeated once in a new
+        process: what others left there may have been the cause.
+
+        Args:
+            data: What the handler gets.
+            timeout_s: Bounds the wait for a process and the work.
+            near: A free process that answered a call with the same text lately is preferred: it may have
+                cached what this call needs.
+            charge: Gets the CPU seconds that the call took, once for each process that worked on it.
+
+        Raises:
+            Crashed: *data* ended the process: a limit, or a signal; the message says which.
+            Overran: *timeout_s* passed during the work, and the process was killed.
+            Busy: *timeout_s* passed before a process was free or had been started.
+            WorkerLost: The processes cannot be started, or were closed; *data* has no part in it.
+            InternalError: The handler raised an exception that is none of the platform's.
+            RsePfError: What the handler raised.
+        """
+        until = time.monotonic() + timeout_s
+        slot = self._free.take(near, until)
+        try:
+            while True:
+                process = slot.process
+                is_new = process is None or not self._template.has(process)
+                if process is None or is_new:
+                    slot.forget()
+                    process = slot.process = self._template.fork(until)
+                slot.note(near)
+                before_s = process.cpu_s
+                try:
+                    return _exchange(process, data, until, self._max_reply_bytes)
+                except TimeoutError:
+                    _, cpu_s = self._end(slot, process)
+                    raise Overran(timeout_s, cpu_s) from None
+                except _ProcessEnded as ended:
+                    how, cpu_s = self._end(slot, process)
+                    if is_new or how == _NO_TIME:
+                        raise self._crash(ended.reason or how, cpu_s) from None
+                finally:
+                    if charge is not None:
+                        charge(process.cpu_s - before_s)
+        finally:
+            self._free.give(slot)
+
+    def pids(self) -> list[int]:
+        """Return the ids of the template, if it runs, and of its processes."""
+        return self._template.pids()
+
+    def close(self) -> None:
+        """End the template and all processes; a call that is under way raises WorkerLost."""
+        self._template.close()
+        self._free.forget_all()
+
+    def _end(self, slot: _Slot, process: _Process) -> tuple[str, float]:
+        """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
+        slot.forget()
+        return self._template.end(process)
+
+    def _crash(self, how: str, cpu_s: float) -> Crashed:
+        if how == _NO_MEMORY:
+            how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
+        elif how == _NO_TIME:
+            how = f"it used {cpu_s:.1f} s of CPU time, which is more than it may"
+        return Crashed(f"the process that worked on this ended: {how}", hint="send less at once")
+
+
+class _Process:
+    """One forked process."""
+
+    def __init__(self, number: int, pid: int, connection: socket.socket) -> None:
+        self.number = number
+        self.pid = pid
+        self.connection = connection
+        self.cpu_s = 0.0
+        """CPU seconds at the end of the last call."""
+
+
+class _Slot:
+    """The place of one process; None until the next call forks it."""
+
+    def __init__(self) -> None:
+        self.process: _Process | None = None
+        self.near: deque[str] = deque(maxlen=_NEAR)
+
+    def note(self, near: str) -> None:
+        """Remember that the process worked near this."""
+        if near in self.near:
+            self.near.remove(near)
+        self.near.append(near)
+
+    def forget(self) -> None:
+        self.near.clear()
+        if self.process is not None:
+            self.process.connection.close()
+            self.process = None
+
+
+class _FreeSlots:
+    """The places where no call is worked on."""
+
+    def __init__(self, count: int) -> None:
+        self._slots = [_Slot() for _ in range(count)]
+        self._changed = threading.Condition()
+
+    def take(self, near: str, until: float) -> _Slot:
+        """Return the one that was near last, else the one that was near to least; raises Busy at *until*."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._slots, max(0.0, until - time.monotonic())):
+                raise _busy_error("no process was free in time")
+            fitting = [row for row, slot in enumerate(self._slots) if near in slot.near]
+            fewest = min(range(len(self._slots)), key=lambda row: len(self._slots[row].near))
+            return self._slots.pop(fitting[-1] if fitting else fewest)
+
+    def give(self, slot: _Slot) -> None:
+        with self._changed:
+            self._slots.append(slot)
+            self._changed.notify()
+
+    def forget_all(self) -> None:
+        with self._changed:
+            for slot in self._slots:
+                slot.forget()
+            self._slots.clear()
+
+
+class _ProcessEnded(Exception):
+    """The process closed its socket, or broke the rules for the reason that is given."""
+
+    def __init__(self, reason: str = "") -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class _Template:
+    """The fork server as its owner sees it: started by the first fork, replaced when it ended."""
+
+    def __init__(self, order: dict[str, Any], niceness: int) -> None:
+        self._order = order
+        self._plan = ChildPlan(
+            target=f"{__name__}:run", name="rse-pf limited", policy="batch", nice=niceness,
+            outlives_parent=True,
+        )  # fmt: skip
+        self._lock = threading.Lock()
+        self._server: Child | None = None
+        self._is_ready = False
+        self._is_closed = False
+        self._number = 0
+        """Of the last fork, of all fork servers."""
+        self._forked: dict[int, int] = {}
+        """The pids of the forks of this server, by number."""
+        self._ends: dict[int, tuple[str, float]] = {}
+        """How forks ended, and their CPU seconds, by number."""
+
+    def has(self, process: _Process) -> bool:
+        """Return whether *process* was forked by the server that runs now."""
+        return process.number in self._forked
+
+    def pids(self) -> list[int]:
+        return ([self._server.pid] if self._server is not None else []) + sorted(self._forked.values())
+
+    def fork(self, until: float) -> _Process:
+        """Return a new process.
+
+        Raises:
+            Busy: The fork server was not ready in time; it goes on starting.
+            WorkerLost: It cannot start, or was closed.
+        """
+        with self._hold_lock(until):
+            if self._is_closed:
+                raise WorkerLost("the processes were closed", hint="try again elsewhere")
+            try:
+                server = self._server = self._server or start_fork_server(self._plan, self._order)
+                self._wait_until_ready(server, until)
+                ours, theirs = socket.socketpair()
+            except OSError as error:
+                raise WorkerLost(f"no process can be started: {error.strerror}", hint="try again") from error
+            with theirs, contextlib.ExitStack() as undo:
+                undo.enter_context(ours)
+                self._number += 1
+                number = self._number
+                self._ask(server, "create", number, theirs.fileno())
+                while number not in self._forked:
+                    self._take_report(server)
+                undo.pop_all()
+            return _Process(number, self._forked[number], ours)
+
+    def end(self, process: _Process) -> tuple[str, float]:
+        """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
+        number = process.number
+        with self._lock:
+            if self._server is None or not self.has(process):
+                raise WorkerLost("the process ended with its template", hint="try again")
+            self._ask(self._server, "end", number)
+            while number not in self._ends:
+                self._take_report(self._server)
+            del self._forked[number]
+            how, cpu_s = self._ends.pop(number)
+        used_s = max(0.0, cpu_s - process.cpu_s)
+        process.cpu_s += used_s
+        return how, used_s
+
+    def close(self) -> None:
+        with self._lock:
+            self._is_closed = True
+            self._stop()
+
+    @contextlib.contextmanager
+    def _hold_lock(self, until: float) -> Iterator[None]:
+        if not self._lock.acquire(timeout=max(0.0, until - time.monotonic())):
+            raise _busy_error("no process was free in time")
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    def _wait_until_ready(self, server: Child, until: float) -> None:
+        if self._is_ready:
+            return
+        server.connection.settimeout(max(1e-3, until - time.monotonic()))
+        try:
+            report, _ = read_packet(server.connection)
+        except TimeoutError:
+            raise _busy_error("the process was not started in time") from None
+        if report is None:
+            self._stop()
+            raise WorkerLost(
+                "the process cannot be started", hint="tell the operator; the server's log has it"
+            )
+        server.connection.settimeout(_ORDER_TIMEOUT_S)
+        self._is_ready = True
+
+    def _ask(self, server: Child, do: str, number: int, *descriptors: int) -> None:
+        try:
+            send_order(server, do, number, *descriptors)
+        except OSError:
+            self._lose()
+
+    def _take_report(self, server: Child) -> None:
+        """Take one report; raises WorkerLost if the fork server has ended or does not answer."""
+        try:
+            report, handles = read_packet(server.connection)
+        except TimeoutError:
+            report, handles = None, []
+        for handle in handles:
+            os.close(handle)
+        if report is None:
+            self._lose()
+        elif report["event"] == "created":
+            self._forked[report["id"]] = report["pid"]
+        else:
+            self._ends[report["id"]] = report["how"], report["cpu_s"]
+
+    def _lose(self) -> NoReturn:
+        self._stop()
+        raise WorkerLost("the template of the processes ended", hint="try again")
+
+    def _stop(self) -> None:
+        """End the fork server, and with it every process, which dies with its parent."""
+        if self._server is not None:
+            self._server.kill()
+        self._server = None
+        self._is_ready = False
+        self._forked.clear()
+        self._ends.clear()
+
+
+def _busy_error(why: str) -> Busy:
+    return Busy(why, hint="try again later, or allow more time", retry_after_ms=_BUSY_RETRY_MS)
+
+
+def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int) -> bytes:
+    """Send *data* and return the reply; raises TimeoutError, `_ProcessEnded` or what the process refused."""
+    connection = process.connection
+    try:
+        connection.settimeout(_left_s(until))
+        connection.sendall(_LENGTH.pack(len(data)))
+        connection.sendall(data)
+        kind, length, process.cpu_s = _REPLY.unpack(_receive(connection, _REPLY.size, until))
+        if length > max_reply_bytes:
+            raise _ProcessEnded(f"it replied with {length} bytes, above {max_reply_bytes}")
+        reply = _receive(connection, length, until)
+    except TimeoutError:
+        raise
+    except OSError:
+        raise _ProcessEnded from None
+    if kind == _DONE:
+        return reply
+    if kind == _REFUSED:
+        code, message, hint, retry_after_ms = json.loads(reply)
+        raise error_from_code(code, message, hint=hint, retry_after_ms=retry_after_ms)
+    raise InternalError("the work failed", hint="the server's log has it")
+
+
+def _receive(connection: socket.socket, size: int, until: float) -> bytes:
+    received = receive_bytes(connection, size, until)
+    if len(received) < size:
+        raise _ProcessEnded
+    return received
+
+
+def _left_s(until: float) -> float:
+    left_s = until - time.monotonic()
+    if left_s <= 0:
+        raise TimeoutError
+    return left_s
+
+
+# --- the fork server ------------------------------------------------------------------------------------
+
+
+def run(owner: socket.socket) -> None:
+    """Fork processes as the *owner* orders, until it is gone."""
+    order, _ = read_packet(owner)
+    if order is None:
+        return
+    memory_bytes, cpu_s = order["limits"]
+    module, _, function = order["target"].partition(":")
+    handler: Handler = getattr(importlib.import_module(module), function)(order["configuration"])
+
+    def fork(number: int, descriptors: list[int]) -> int:
+        pid = os.fork()
+        if pid == 0:
+            _work(owner, handler, memory_bytes, cpu_s, socket.socket(fileno=descriptors[0]))
+        return pid
+
+    serve_forks(owner, ForkPlan(fork=fork, keeps_ended=True))
+
+
+def _work(
+    owner: socket.socket, handler: Handler, memory_bytes: int, cpu_s: float, connection: socket.socket
+) -> NoReturn:
+    """Answer calls until the connection ends; never return."""
+    try:
+        template = os.getppid()
+        close_other_descriptors(connection.fileno())
+        if die_with_parent(template):
+            limit_memory(memory_bytes, beyond_now=True)
+            be_killed_first()
+            _silence_libraries()
+            while _answer(connection, handler, cpu_s):
+                pass
+        os._exit(0)
+    except MemoryError:
+        os._exit(_OUT_OF_MEMORY)
+    finally:
+        os._exit(1)
+
+
+def limit_cpu(cpu_s: float) -> None:
+    """End this process after *cpu_s* more seconds of CPU time unless it answers before; 0: never."""
+    signal.setitimer(signal.ITIMER_PROF, cpu_s)
+
+
+def _silence_libraries() -> None:
+    """Drop what native code prints, which the bytes of a call may choose; a traceback goes to the log."""
+    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+
+
+def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
+    """Answer one call; return False at the end of the connection."""
+    header = connection.recv(_LENGTH.size, socket.MSG_WAITALL)
+    if len(header) < _LENGTH.size:
+        return False
+    (length,) = _LENGTH.unpack(header)
+    data = connection.recv(length, socket.MSG_WAITALL)
+    if len(data) < length:
+        return False
+    limit_cpu(cpu_s)
+    try:
+        kind, reply = _DONE, handler(data)
+    except MemoryError:
+        raise
+    except RsePfError as error:
+        fields = [error.code, error.message, error.hint, error.retry_after_ms]
+        kind, reply = _REFUSED, json.dumps(fields).encode()
+    except BaseException:  # noqa: BLE001  the reason goes to the log, and the process answers the next call
+        traceback.print_exc()
+        kind, reply = _DEFECT, b""
+    limit_cpu(0.0)
+    try:
+        connection.sendall(_REPLY.pack(kind, len(reply), time.process_time()))
+        connection.sendall(reply)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,608 @@
+"""Objects: bytes under a name, in a folder, in memory, and (in `rse_pf.aws`) in S3.
+
+All stores follow one contract: once `put` returns, the object is complete and durable, whatever crashes
+next.  No name can refer to a file outside the folder of a store.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import os
+import re
+import secrets
+import stat
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Protocol, runtime_checkable
+
+from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull, UsageError
+from rse_pf.storage.disk_reserve import DiskReserve, is_full
+from rse_pf.storage.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
+
+__all__ = [
+    "MIN_CHARGE_BYTES",
+    "DirectoryStore",
+    "MemoryStore",
+    "ObjectInfo",
+    "ObjectStore",
+    "PresigningStore",
+    "Usage",
+    "charge_of",
+    "check_name",
+    "digest_of",
+    "is_name",
+    "open_store",
+]
+
+_Names = list[str]  # within a class that has a method "list"
+_SHARD, _LOCK = "+", ".lock-"
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_WRITE_TRIES = 8
+# A folder that changed within this time before it was read may change again at the same time of change.
+_UNSETTLED_NS = 100_000_000
+_MAX_MEASURED = 100_000
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectInfo:
+    """Name and size of an object, known without reading it."""
+
+    name: str
+    size: int
+
+
+MIN_CHARGE_BYTES = 4096
+"""An object counts for at least this much of a quota: a file takes a block and an inode, however short."""
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What objects count for: their number, and their bytes with `MIN_CHARGE_BYTES` for each at least."""
+
+    objects: int = 0
+    charged_bytes: int = 0
+
+    def __add__(self, other: Usage) -> Usage:
+        """Return the sum."""
+        return Usage(self.objects + other.objects, self.charged_bytes + other.charged_bytes)
+
+
+class ObjectStore(Protocol):
+    """Bytes by name.  Every method raises only StoreError and its subclasses."""
+
+    def get(self, name: str) -> bytes:
+        """Return the object; raises NotFound."""
+
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return at most *length* bytes from *start* on; raises NotFound."""
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object durably and atomically; raises StoreFull."""
+
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object durably and atomically; if *pieces* raises an error, nothing is stored."""
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name; raises NotFound."""
+
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield, sorted, what stands between *prefix*, which ends with /, and the next slash in names."""
+
+    def usage(self, prefix: str) -> Usage:
+        """Return the usage of the objects below the folder *prefix*, which ends with a slash."""
+
+    def delete(self, name: str) -> None:
+        """Remove the object; a missing one is no error."""
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected* (None: is missing); raises Conflict."""
+
+
+@runtime_checkable
+class PresigningStore(Protocol):
+    """A store that can sign URLs for one object and a limited time, without any request: a bucket of S3."""
+
+    def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
+        """Return a URL and the headers with which exactly these bytes can be PUT."""
+
+    def presigned_get(self, name: str, *, ttl_s: int) -> str:
+        """Return a URL from which the object can be read."""
+
+
+def charge_of(size: int) -> int:
+    """Return for how many bytes of a quota an object of *size* bytes counts."""
+    return max(size, MIN_CHARGE_BYTES)
+
+
+def usage_of(listed: Iterable[ObjectInfo]) -> Usage:
+    """Return the usage of the objects in a list."""
+    return sum((Usage(1, charge_of(info.size)) for info in listed), Usage())
+
+
+def digest_of(data: bytes) -> str:
+    """Return the sha256 of *data* in hex: the name of an immutable object."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def is_name(name: str) -> bool:
+    """Return whether *name* consists of at most ten plain path segments."""
+    return _NAME.fullmatch(name) is not None
+
+
+def check_name(name: str) -> str:
+    """Return *name*; raises StoreError unless it consists of at most ten plain path segments."""
+    if not is_name(name):
+        raise StoreError(
+            f"{name[:80]!r} is not a name of an object",
+            hint="use segments of letters, digits and . _ = -, joined by /",
+        )
+    return name
+
+
+def open_store(
+    location: str, openers: Mapping[str, Callable[[str], ObjectStore]] | None = None
+) -> ObjectStore:
+    """Return the store at ``dir:PATH``, ``memory:``, or what *openers* know by kind, as ``s3:BUCKET``.
+
+    For S3 pass ``{"s3": lambda bucket: open_bucket(bucket, region)}`` with `open_bucket` of `rse_pf.aws`.
+    """
+    kind, _, place = location.partition(":")
+    if kind == "memory":
+        return MemoryStore()
+    if kind == "dir" and place:
+        return DirectoryStore(Path(place))
+    if openers and kind in openers and place:
+        return openers[kind](place)
+    raise UsageError(f"{location!r} is not a store", hint="write dir:PATH, s3:BUCKET or memory:")
+
+
+class MemoryStore:
+    """Objects in the memory of one process."""
+
+    def __init__(self) -> None:
+        self._objects: dict[str, bytes] = {}
+        self._lock = threading.Lock()
+
+    def get(self, name: str) -> bytes:
+        """Return the object."""
+        with self._lock:
+            data = self._objects.get(check_name(name))
+        if data is None:
+            raise NotFound(f"no object named {name!r}")
+        return data
+
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return a part of the object."""
+        return self.get(name)[start : start + length]
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object."""
+        with self._lock:
+            self._objects[check_name(name)] = bytes(data)
+
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object; if *pieces* raises an error, nothing is stored."""
+        self.put(name, b"".join(pieces))
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name."""
+        return ObjectInfo(name=name, size=len(self.get(name)))
+
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*."""
+        with self._lock:
+            sizes = sorted(
+                (name, len(data))
+                for name, data in self._objects.items()
+                if name.startswith(prefix) and name > after
+            )
+        for name, size in sizes:
+            yield ObjectInfo(name=name, size=size)
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield what stands between *prefix* and the next slash in names."""
+        rests = (info.name.removeprefix(prefix).partition("/") for info in self.list(prefix))
+        yield from sorted({folder for folder, slash, _ in rests if slash})
+
+    def usage(self, prefix: str) -> Usage:
+        """Return the usage of the objects below *prefix*."""
+        return usage_of(self.list(prefix))
+
+    def delete(self, name: str) -> None:
+        """Remove the object."""
+        with self._lock:
+            self._objects.pop(check_name(name), None)
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected*."""
+        with self._lock:
+            if self._objects.get(check_name(name)) != expected:
+                raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
+            self._objects[name] = bytes(data)
+
+
+class DirectoryStore:
+    """Objects as files below one folder, written by temporary file, fsync and rename.
+
+    A robot's objects lie in up to 256 folders by the first two digits of their digests, as
+    ``objects/TENANT/ROBOT/+ab/DIGEST``, so that a page of a list reads a few small folders.
+    """
+
+    def __init__(self, folder: Path, reserve: DiskReserve | None = None) -> None:
+        """Describe the store; on a full disk `compare_and_swap` takes space from *reserve*."""
+        self._folder, self._root = folder, str(folder)
+        self._reserve = reserve
+        self._measured: dict[str, tuple[int, Usage, _Names]] = {}
+
+    def get(self, name: str) -> bytes:
+        """Return the object."""
+        with _as_store_errors(name), _open(self._path(name)) as file:
+            return file.read()
+
+    def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
+        """Return size and a part of the object if these bytes are in memory."""
+        return _read_cached(self._path(name), start, length)
+
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return a part of the object."""
+        with _as_store_errors(name), _open(self._path(name)) as file:
+            return os.pread(file.fileno(), length, start)
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object durably."""
+        self._write(name, lambda path: replace_file(path, data, mode=OWNER_ONLY, is_durable=True))
+
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object durably; if *pieces* raises an error, nothing is stored."""
+        self._write(name, lambda path: _replace_by_pieces(path, pieces))
+
+    def append(self, name: str, offset: int, data: bytes) -> None:
+        """Add *data* to the object of *offset* bytes, which is missing if that is 0.
+
+        The object survives this process, but a crash of the machine may damage it.  A lock on its file
+        excludes other writers.
+
+        Raises:
+            Conflict: The object has another size.
+            Busy: Another process writes it.
+        """
+
+        def add(path: str) -> None:
+            with _locked(path, 0 if offset else os.O_CREAT, offset) as handle:
+                try:
+                    view, at = memoryview(data), offset
+                    while view:
+                        count = os.pwrite(handle, view, at)
+                        view, at = view[count:], at + count
+                except OSError:
+                    os.ftruncate(handle, offset)
+                    raise
+
+        self._write(name, add)
+
+    def adopt(self, name: str, source: str, size: int) -> None:
+        """Give the object *source* the name *name*, durably.
+
+        Raises:
+            NotFound: It is missing.
+            Conflict: It does not have *size* bytes.
+            Busy: Another process writes it.
+        """
+        grown = self._path(source)
+
+        def rename(path: str) -> None:
+            with _locked(grown, 0, size) as handle:
+                os.fsync(handle)
+                os.rename(grown, path)
+            sync_folder(os.path.dirname(path))
+
+        self._write(name, rename)
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name."""
+        with _as_store_errors(name):
+            status = os.lstat(self._path(name))
+        if not stat.S_ISREG(status.st_mode):
+            raise NotFound(f"no object named {name!r}")
+        return ObjectInfo(name=name, size=status.st_size)
+
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*.
+
+        Only the folders that the caller's iteration reaches are read.
+        """
+        above, slash, _ = prefix.rpartition("/")
+        if not slash or is_name(above):
+            yield from self._walk(above + slash, above + slash, prefix, after)
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield what stands between *prefix* and the next slash in names."""
+        yield from sorted(name for name in self._scan(prefix)[1] if is_name(name))
+
+    def usage(self, prefix: str) -> Usage:
+        """Return the usage of the objects below *prefix*; only folders that changed are read again."""
+        place = f"{self._folder}/{prefix}"
+        with _as_store_errors(prefix):
+            try:
+                changed_ns = os.stat(place).st_mtime_ns
+            except (FileNotFoundError, NotADirectoryError):
+                return Usage()
+        known = self._measured.get(place)
+        if known is None or known[0] != changed_ns:
+            known = changed_ns, *self._measure(prefix)
+            if time.time_ns() - changed_ns > _UNSETTLED_NS:
+                if len(self._measured) >= _MAX_MEASURED:
+                    self._measured.clear()
+                self._measured[place] = known
+        total = known[1]
+        for folder in known[2]:
+            total += self.usage(f"{prefix}{folder}/")
+        return total
+
+    def space(self) -> tuple[int, int]:
+        """Return the free bytes of the disk, and its size."""
+        folder = self._folder
+        while True:
+            with _as_store_errors(str(self._folder)), contextlib.suppress(FileNotFoundError):
+                disk = os.statvfs(folder)
+                return disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
+            folder = folder.parent
+
+    def delete(self, name: str) -> None:
+        """Remove the object, and its folder if nothing else lies there; a missing one is no error."""
+        path = self._path(name)
+        folder, lock = os.path.dirname(path), _lock_of(path)
+        with contextlib.suppress(NotFound), _as_store_errors(name):
+            self.head(name)
+            with _hold_lock(lock) if os.path.exists(lock) else contextlib.nullcontext():
+                for each in (path, lock):
+                    with contextlib.suppress(FileNotFoundError):
+                        os.unlink(each)
+            if folder != self._root and not os.path.basename(folder).startswith(_SHARD):
+                with contextlib.suppress(OSError):  # it is not empty
+                    os.rmdir(folder)
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected*; a lock file excludes other writers."""
+
+        def check() -> None:
+            try:
+                current = self.get(name)
+            except NotFound:
+                current = None
+            if current != expected:
+                raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
+
+        def swap(path: str) -> None:
+            check()
+            lock = _lock_of(path)
+            while True:
+                # Written before it is locked: a process that is paused hardly ever holds the lock then.
+                try:
+                    with _temporary(path, [data]) as temporary, _hold_lock(lock):
+                        check()
+                        os.replace(temporary, path)
+                    break
+                except OSError as error:
+                    if self._reserve is None or not is_full(error) or not self._reserve.release(len(data)):
+                        raise
+            sync_folder(os.path.dirname(path))
+
+        self._write(name, swap)
+
+    def sweep(self, *, now: float, older_than_s: float) -> int:
+        """Remove the temporary files of writers that crashed and return their number; *now* is Unix time."""
+        removed = 0
+        for at, _, names in os.walk(self._folder):
+            for path in (Path(at, name) for name in names if name.startswith(TEMPORARY_PREFIX)):
+                with contextlib.suppress(FileNotFoundError):
+                    if now - path.lstat().st_mtime > older_than_s:
+                        path.unlink()
+                        removed += 1
+        return removed
+
+    def _path(self, name: str) -> str:
+        path = f"{self._root}/{check_name(name)}"
+        folder, _, last = path.rpartition("/")
+        is_of_robot = name.startswith("objects/") and _DIGEST.fullmatch(last) is not None
+        return f"{folder}/{_SHARD}{last[:2]}/{last}" if is_of_robot else path
+
+    def _write(self, name: str, write: Callable[[str], None]) -> None:
+        """Call *write* for the path of the object; again if there was no folder, which is made first."""
+        path = self._path(name)
+        changed: list[str] = []
+        with _as_store_errors(name):
+            for tries_left in reversed(range(_WRITE_TRIES)):
+                try:
+                    write(path)
+                except (FileNotFoundError, NotADirectoryError):
+                    if not tries_left:
+                        raise
+                    changed += _make_folder(os.path.dirname(path))
+                else:
+                    break
+            # Last, because what was written is then in the same commit of the file system's journal.
+            for folder in reversed(changed):
+                sync_folder(folder)
+
+    def _measure(self, prefix: str) -> tuple[Usage, _Names]:
+        """Return the usage of the objects in the folder *prefix* itself, and the folders in it."""
+        objects = charged = 0
+        files, folders = self._scan(prefix)
+        for name in files:
+            if is_name(name):
+                with contextlib.suppress(FileNotFoundError):
+                    objects += 1
+                    charged += charge_of(os.lstat(f"{self._folder}/{prefix}{name}").st_size)
+        return Usage(objects, charged), folders
+
+    def _scan(self, at: str) -> tuple[_Names, _Names]:
+        """Return the names of the files and of the folders in the folder *at*, which is "" or ends with /."""
+        files, folders = [], []
+        with (
+            _as_store_errors(at), contextlib.suppress(FileNotFoundError, NotADirectoryError),
+            os.scandir(f"{self._folder}/{at}") as entries,
+        ):  # fmt: skip
+            for entry in entries:
+                if entry.is_file(follow_symlinks=False):
+                    files.append(entry.name)
+                elif entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.name)
+        return files, folders
+
+    def _walk(self, place: str, at: str, prefix: str, after: str) -> Iterator[ObjectInfo]:
+        """Yield the objects in the folder *place*, whose names begin with *at*, in the order of names."""
+        files, folders = self._scan(place)
+        rows = [(name, name) for name in files]
+        # The names in the folder +ab begin with ab, so it sorts where ab does.
+        rows += [(name[1:] if name.startswith(_SHARD) else f"{name}/", f"{name}/") for name in folders]
+        for begin, entry in sorted(rows):
+            name = at + begin
+            if not entry.endswith("/"):
+                if name.startswith(prefix) and name > after and is_name(name):
+                    with contextlib.suppress(FileNotFoundError):
+                        size = os.lstat(f"{self._folder}/{place}{entry}").st_size
+                        yield ObjectInfo(name=name, size=size)
+            elif (name.startswith(prefix) or prefix.startswith(name)) and (
+                name >= after or after.startswith(name)
+            ):
+                yield from self._walk(place + entry, at if entry.startswith(_SHARD) else name, prefix, after)
+
+
+def _open(path: str) -> BinaryIO:
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
+
+
+def _read_cached(path: str, start: int, length: int) -> tuple[int, bytes] | None:
+    """Return the size of the file at *path*, which is no link, and at most *length* bytes from *start* on.
+
+    None if it may be absent or these bytes are not in memory, so that reading them would wait for the disk.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            return None
+        data = bytearray(max(0, min(length, status.st_size - start)))
+        got = os.preadv(descriptor, [data], start, os.RWF_NOWAIT) if data else 0
+        return (status.st_size, bytes(data)) if got == len(data) else None
+    except OSError:  # a part is not in memory, or the file system does not know
+        return None
+    finally:
+        os.close(descriptor)
+
+
+def _lock_of(path: str) -> str:
+    folder, _, last = path.rpartition("/")
+    return f"{folder}/{_LOCK}{last}"
+
+
+def _make_folder(folder: str) -> list[str]:
+    """Create *folder* and its missing parents; return the folders that the caller has to sync for that."""
+    missing = []
+    while not os.path.isdir(folder):
+        missing.append(folder)
+        folder = os.path.dirname(folder) or "."
+    for made in reversed(missing):
+        try:
+            os.mkdir(made)
+        except FileNotFoundError:
+            break  # a remover took its parent meanwhile: the caller tries again
+        except FileExistsError as error:
+            if _is_no_folder(made):
+                raise StoreError(
+                    f"{os.path.basename(made)!r} is an object, not a folder", hint="choose another name"
+                ) from error
+    return [os.path.dirname(made) or "." for made in reversed(missing)]
+
+
+def _is_no_folder(path: str) -> bool:
+    """Return whether something else than a folder is at *path*; False if a remover took it meanwhile."""
+    try:
+        return not stat.S_ISDIR(os.stat(path).st_mode)
+    except FileNotFoundError:
+        return os.path.islink(path)
+
+
+@contextlib.contextmanager
+def _locked(path: str, flags: int, size: int) -> Iterator[int]:
+    """Yield a descriptor of the file *path*, locked; raises Conflict unless it has *size* bytes."""
+    handle = os.open(path, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, OWNER_ONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not _is_at(path, handle) or os.fstat(handle).st_size != size:
+            raise Conflict("the upload was changed meanwhile", hint="ask for its progress")
+        yield handle
+    except BlockingIOError as error:
+        raise Busy("another server writes this upload", hint="retry later", retry_after_ms=1000.0) from error
+    finally:
+        os.close(handle)
+
+
+def _replace_by_pieces(path: str, pieces: Iterator[bytes]) -> None:
+    with _temporary(path, pieces) as temporary:
+        os.replace(temporary, path)
+    sync_folder(os.path.dirname(path))
+
+
+@contextlib.contextmanager
+def _temporary(path: str, pieces: Iterable[bytes]) -> Iterator[str]:
+    """Write a file beside *path* durably; it is removed if the caller raises an error."""
+    temporary = f"{os.path.dirname(path)}/{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
+    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, OWNER_ONLY)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            for piece in pieces:
+                file.write(piece)
+            file.flush()
+            os.fsync(handle)
+        yield temporary
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
+        raise
+
+
+@contextlib.contextmanager
+def _hold_lock(path: str) -> Iterator[None]:
+    """Hold the lock file *path*, which its holder may remove."""
+    while True:
+        with open(path, "wb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if _is_at(path, file.fileno()):  # else it was removed while this writer waited
+                yield
+                return
+
+
+def _is_at(path: str, handle: int) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), os.lstat(path))
+    except FileNotFoundError:
+        return False
+
+
+@contextlib.contextmanager
+def _as_store_errors(name: str) -> Iterator[None]:
+    try:
+        yield
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        raise NotFound(f"no object named {name!r}") from error
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise NotFound(f"no object named {name!r}") from error
+        if is_full(error):
+            raise StoreFull(f"no space left for {name!r}", hint="free some space") from error
+        raise StoreError(f"{name!r}: {error.strerror}", hint="check the folder of the store") from error

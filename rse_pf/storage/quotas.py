@@ -1,0 +1,473 @@
+"""Limit the bytes that robots and tenants store: counted in one place, and reserved before they are written.
+
+A robot is charged with its objects, its unfinished uploads and the versions of maps that it committed.  Its
+tenant is charged with all of that and with what nobody alone owns: old and new versions of maps; logs,
+snapshots and features of live maps; states of services; jobs that wait.  Nothing is ever removed to make
+something fit, and to read or to remove is never refused.
+
+The bytes of a tenant count for all processes: ``accounts/TENANT`` holds what was counted last and what was
+granted since then, and changes by compare-and-swap.  A process draws a few MiB at a time and spends them from
+memory.  ``quotas/TENANT`` holds the quota that an operator gave to this tenant alone.  The bytes of
+a robot count for one process, which counts again what others stored every `_RECOUNT_S`
+in a folder (reading only what changed) and every `_SLOW_RECOUNT_S` in other stores.
+
+On a disk with little free space each tenant may fill its share: what all tenants hold and what is free,
+divided by the number of tenants.  So a tenant that fills the disk is refused while others go on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import msgspec
+
+from rse_pf.config import DataSettings
+from rse_pf.errors import Busy, Conflict, NotFound, QuotaExceeded, StoreError, StoreFull
+from rse_pf.identity import RobotId, name_segment
+from rse_pf.storage.charges import sum_charges
+from rse_pf.storage.object_store import (
+    MIN_CHARGE_BYTES,
+    DirectoryStore,
+    ObjectStore,
+    Usage,
+    charge_of,
+)
+
+__all__ = [
+    "Accounts", "TenantAccount", "own_quota_bytes", "set_own_quota", "stored_by_tenant", "tenant_folders",
+]  # fmt: skip
+
+_K = TypeVar("_K")
+_T = TypeVar("_T")
+_RECOUNT_S = 10.0  # between two counts of a folder, which reads only what changed
+_SLOW_RECOUNT_S = 600.0  # between two counts of another store, which lists all objects
+_REFUSED_RECOUNT_SHARE = 0.1
+"""Before a refusal a tenant is counted again after this share of the usual time: it may have deleted."""
+_MAX_ACCOUNTS = 10_000
+_MAX_DRAWN_BYTES = 16 << 20  # bytes that a process draws from an account at once, at most
+_DRAWN_SHARE = 64  # it draws this fraction of what is left, so that a full account is shared finely
+_DRAWN_S = 5.0  # drawn bytes expire after this time, so that a process that ended holds none for long
+_WRITTEN_S = 15.0  # an object is written this long after its bytes were drawn, at the latest
+_SWAPS = 50
+_SHARE_S = 1.0
+_RESERVE_SHARE = 0.1
+"""Share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than
+its share is refused."""
+_NEVER = float("-inf")
+_OF_TENANT = ("objects", "maps", "live", "states", "jobs")
+
+
+class _Ledger(msgspec.Struct, frozen=True, array_like=True):
+    """``accounts/TENANT``: bytes that were counted at Unix time *counted_s*, and what was granted since."""
+
+    counted_s: float
+    charged_bytes: int
+    granted: tuple[tuple[float, int], ...] = ()
+
+    @property
+    def used_bytes(self) -> int:
+        return self.charged_bytes + sum(size for _, size in self.granted)
+
+
+_encode = msgspec.json.Encoder().encode
+_decode = msgspec.json.Decoder(_Ledger).decode
+
+
+class TenantAccount:
+    """The bytes of one tenant, as one process charges them.  Blocking; used by several threads."""
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        tenant: str,
+        settings: DataSettings,
+        *,
+        wall_clock: Callable[[], float] = time.time,
+        check: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Count nothing yet.
+
+        Args:
+            store: The store that all processes share.
+            tenant: The name of the tenant.
+            settings: The quota of the tenant, and the reserve of the disk.
+            wall_clock: The clock, Unix seconds.
+            check: Called between two reads; ends the work by the error that it raises.
+        """
+        self._store, self._settings, self._wall_clock, self._check = store, settings, wall_clock, check
+        self._tenant, self._folder = tenant, name_segment(tenant)
+        self._name = f"accounts/{self._folder}"
+        self._recount_s = _recount_s(store)
+        self._lock = threading.Lock()
+        self._drawn_bytes, self._drawn_s = 0, _NEVER
+        self._share_bytes, self._share_s = 0.0, _NEVER
+
+    def quota_bytes(self) -> int:
+        """Return what the tenant may store, which an operator may change at any time; raises StoreError."""
+        own = own_quota_bytes(self._store, self._folder)
+        return self._settings.tenant_quota_bytes if own is None else own
+
+    def try_charge(self, size: int) -> bool:
+        """Charge an object of *size* bytes unless that needs the store; return whether it was charged."""
+        charge = charge_of(size)
+        if not self._lock.acquire(blocking=False):
+            return False
+        try:
+            return self._spend_drawn(charge)
+        finally:
+            self._lock.release()
+
+    def reserve(self, size: int, *, margin: int = 0, freed: int = 0) -> None:
+        """Charge an object of *size* bytes, which is written now.
+
+        Args:
+            size: Of the object.
+            margin: Bytes that must be left besides, for what follows from it.
+            freed: Bytes that are removed when the object is written.
+
+        Raises:
+            QuotaExceeded: The tenant would store more than its own quota, or ``data.tenant_quota_bytes``.
+            StoreFull: The disk is nearly full, and the tenant holds more than its share of it.
+            StoreError: The store fails.
+        """
+        charge = charge_of(size)
+        with self._lock:
+            if not self._spend_drawn(charge):
+                drawn = self._draw(charge, margin - freed)
+                self._drawn_bytes += drawn - charge
+                self._drawn_s = self._wall_clock()
+
+    def release(self, size: int) -> None:
+        """Charge *size* bytes less: an object was removed, or was not written."""
+        with self._lock:
+            if self._is_drawn():
+                self._drawn_bytes += charge_of(size)
+
+    def _is_drawn(self) -> bool:
+        is_drawn = 0.0 <= self._wall_clock() - self._drawn_s < _DRAWN_S
+        if not is_drawn:
+            self._drawn_bytes = 0
+        return is_drawn
+
+    def _spend_drawn(self, charge: int) -> bool:
+        if not self._is_drawn() or self._drawn_bytes < charge:
+            return False
+        self._drawn_bytes -= charge
+        return True
+
+    def _draw(self, charge: int, margin: int) -> int:
+        """Grant *charge* bytes and some more to this process; return how many."""
+        for _ in range(_SWAPS):
+            known = self._read()
+            now = self._wall_clock()
+            ledger = _ledger(known)
+            if ledger is None or not 0.0 <= now - ledger.counted_s < self._recount_s:
+                ledger = self._recount(ledger)
+            refused = self._refusal(ledger, charge, margin)
+            if refused and now - ledger.counted_s >= _REFUSED_RECOUNT_SHARE * self._recount_s:
+                ledger = self._recount(ledger)
+                refused = self._refusal(ledger, charge, margin)
+            if refused is not None:
+                with contextlib.suppress(StoreError):  # what was counted saves others the same work
+                    if ledger != _ledger(known):
+                        self._store.compare_and_swap(self._name, known, _encode(ledger))
+                raise refused
+            free_bytes = min(self.quota_bytes() - ledger.used_bytes - margin, self._free_bytes())
+            drawn = max(charge, min(_MAX_DRAWN_BYTES, int(free_bytes // _DRAWN_SHARE)))
+            try:
+                self._store.compare_and_swap(self._name, known, _encode(_with_grant(ledger, now, drawn)))
+            except Conflict:
+                continue
+            return drawn
+        raise Busy(f"the account of tenant {self._tenant!r} changes all the time", retry_after_ms=500.0)
+
+    def _read(self) -> bytes | None:
+        try:
+            return self._store.get(self._name)
+        except NotFound:
+            return None
+
+    def _recount(self, before: _Ledger | None) -> _Ledger:
+        """Count what lies in the store; grants that may not be written yet stay."""
+        begun_s = self._wall_clock()
+        charged = stored_by_tenant(self._store, self._folder, self._check).charged_bytes
+        granted = () if before is None else before.granted
+        return _Ledger(begun_s, charged, tuple(grant for grant in granted if grant[0] > begun_s - _WRITTEN_S))
+
+    def _refusal(self, ledger: _Ledger, charge: int, margin: int) -> QuotaExceeded | StoreFull | None:
+        used, own = ledger.used_bytes, own_quota_bytes(self._store, self._folder)
+        most, name = self._settings.tenant_quota_bytes, "data.tenant_quota_bytes"
+        if own is not None:
+            most, name = own, "its own quota"
+        if used + charge + margin > most:
+            more = charge + max(0, margin)
+            return QuotaExceeded(
+                f"the tenant {self._tenant!r} stores {used} bytes; {more} more are above {name} {most}",
+                hint="delete objects, remove old versions of maps (rse-pf map prune), or raise the quota: "
+                f"rse-pf tenant quota {self._tenant} --quota data_bytes=N",
+            )
+        free = self._free_bytes()
+        if free >= charge:
+            return None
+        share, held = self._share(), ledger.used_bytes
+        if held + charge + margin <= share:
+            return None
+        return StoreFull(
+            f"the disk is nearly full, and the tenant {self._tenant!r} holds {held} bytes of its share of "
+            f"{share:.0f}",
+            hint="delete objects or maps of this tenant, or use a larger disk",
+        )
+
+    def _free_bytes(self) -> float:
+        """Return how many bytes are free above the reserve of the disk."""
+        if not isinstance(self._store, DirectoryStore):
+            return float("inf")
+        free, total = self._store.space()
+        return free - int(total * _RESERVE_SHARE)
+
+    def _share(self) -> float:
+        """Return how many bytes a tenant may hold while the disk is nearly full."""
+        if not isinstance(self._store, DirectoryStore):
+            return float("inf")
+        now = self._wall_clock()
+        if 0.0 <= now - self._share_s < _SHARE_S:
+            return self._share_bytes
+        folders = {self._folder, *tenant_folders(self._store)}
+        held = sum(stored_by_tenant(self._store, folder, self._check).charged_bytes for folder in folders)
+        self._share_s, self._share_bytes = now, (held + self._store.space()[0]) / max(2, len(folders))
+        return self._share_bytes
+
+
+def _ledger(data: bytes | None) -> _Ledger | None:
+    """Return the ledger in *data*; None without data and for damaged data, so that all is counted."""
+    with contextlib.suppress(msgspec.MsgspecError):
+        return None if data is None else _decode(data)
+    return None
+
+
+def _with_grant(ledger: _Ledger, now: float, size: int) -> _Ledger:
+    """Return *ledger* with a grant; grants of the same 10 s are one, as if made at their end."""
+    at = now // _RECOUNT_S * _RECOUNT_S + _RECOUNT_S
+    before = ledger.granted
+    if before and before[-1][0] == at:
+        before, size = before[:-1], before[-1][1] + size
+    return msgspec.structs.replace(ledger, granted=(*before, (at, size)))
+
+
+def own_quota_bytes(store: ObjectStore, folder: str) -> int | None:
+    """Return the quota that an operator gave to the tenant with this folder; None if the setting applies.
+
+    Raises:
+        StoreError: The store fails, or the quota is damaged.
+    """
+    try:
+        return int(store.get(_quota_name(folder)))
+    except NotFound:
+        return None
+    except ValueError as error:
+        raise StoreError("the quota of the tenant is damaged", hint="set it: rse-pf tenant quota") from error
+
+
+def set_own_quota(store: ObjectStore, folder: str, quota_bytes: int | None) -> None:
+    """Give a tenant a quota of its own; None means ``data.tenant_quota_bytes``.
+
+    Processes see it when they draw bytes next, at most `_DRAWN_S` later.
+    """
+    if quota_bytes is None:
+        store.delete(_quota_name(folder))
+    else:
+        store.put(_quota_name(folder), str(quota_bytes).encode())
+
+
+def _quota_name(folder: str) -> str:
+    return f"quotas/{folder}"
+
+
+def tenant_folders(store: ObjectStore) -> set[str]:
+    """Return the folders of all tenants that store anything."""
+    return {folder for area in _OF_TENANT for folder in store.folders(f"{area}/")}
+
+
+def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] = lambda: None) -> Usage:
+    """Return the usage that the tenant with this folder is charged with."""
+    total = Usage()
+    for area in _OF_TENANT:
+        check()
+        total += store.usage(f"{area}/{folder}/")
+    for robot in store.folders(f"uploads/{folder}/"):
+        total += _uploads(store, f"{folder}/{robot}/", check)
+    return total
+
+
+def _uploads(store: ObjectStore, folder: str, check: Callable[[], None]) -> Usage:
+    """Return the usage of the unfinished uploads of a robot, counted with their final sizes."""
+    total = Usage()
+    for upload in store.folders(f"uploads/{folder}"):
+        check()
+        with contextlib.suppress(NotFound):  # it has just been completed
+            total += Usage(1, charge_of(int(store.get(f"uploads/{folder}{upload}/size").split()[0])))
+    return total
+
+
+@dataclass(slots=True)
+class _RobotAccount:
+    """What is known about one robot; *lock* guards the rest."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    counted_s: float = _NEVER
+    stored: Usage = field(default_factory=Usage)
+    writing: Usage = field(default_factory=Usage)
+
+
+class Accounts:
+    """The accounts of all robots and tenants in one process.  Blocking; used by several threads."""
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        settings: DataSettings,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
+        check: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Count nothing yet.
+
+        Args:
+            store: Of the platform.
+            settings: With the quotas.
+            clock: Seconds, monotonic.
+            wall_clock: Unix seconds.
+            check: Called between two reads; ends the work by the error that it raises.
+        """
+        self._store, self._settings = store, settings
+        self._clock, self._wall_clock, self._check = clock, wall_clock, check
+        self._recount_s = _recount_s(store)
+        self._lock = threading.Lock()  # of the dictionaries, never held during work
+        self._robots: OrderedDict[RobotId, _RobotAccount] = OrderedDict()
+        self._tenants: OrderedDict[str, TenantAccount] = OrderedDict()
+
+    @contextlib.contextmanager
+    def reservation(self, robot: RobotId, size: int, max_bytes: float | None = None) -> Iterator[None]:
+        """Count one object of *size* bytes for a robot while it is written; take it back if that fails.
+
+        Args:
+            robot: Who stores it.
+            size: Of the object.
+            max_bytes: What the robot may store; None for ``data.quota_bytes``.
+
+        Raises:
+            QuotaExceeded: The robot or its tenant would store more than its quota, or the robot more objects.
+            StoreFull: As for `TenantAccount.reserve`.
+        """
+        account, charge = self._account(robot), Usage(1, charge_of(size))
+        tenant = self.tenant(robot.tenant)
+        with account.lock:
+            self._count_if_old(account, robot)
+            self._check_robot(robot, account.stored + account.writing, charge, max_bytes)
+            account.writing += charge
+            counted_s = account.counted_s
+        is_stored = is_charged = False
+        try:
+            tenant.reserve(size)
+            is_charged = True
+            yield
+            is_stored = True
+        finally:
+            if is_charged and not is_stored:
+                tenant.release(size)
+            with account.lock:
+                account.writing = _subtract(account.writing, charge)
+                if account.counted_s != counted_s:
+                    account.counted_s = _NEVER  # a count meanwhile may have seen the object, or not
+                elif is_stored:
+                    account.stored += charge
+
+    def check_room(self, robot: RobotId, size: int, max_bytes: float | None = None) -> None:
+        """Raise what `reservation` would raise for the robot now; nothing is reserved."""
+        account = self._account(robot)
+        with account.lock:
+            self._count_if_old(account, robot)
+            used, charge = account.stored + account.writing, Usage(1, charge_of(size))
+            self._check_robot(robot, used, charge, max_bytes)
+
+    def release(self, robot: RobotId, size: int) -> None:
+        """Count one object of *size* bytes less."""
+        account = self._account(robot)
+        with account.lock:
+            account.stored = _subtract(account.stored, Usage(1, charge_of(size)))
+        self.tenant(robot.tenant).release(size)
+
+    def forget(self, robot: RobotId) -> None:
+        """Count the robot's objects anew when it writes next."""
+        account = self._account(robot)
+        with account.lock:
+            account.counted_s = _NEVER
+
+    def forget_all(self, tenant: str) -> None:
+        """Count the robots of a tenant anew when they write next."""
+        with self._lock:
+            robots = [robot for robot in self._robots if robot.tenant == tenant]
+        for robot in robots:
+            self.forget(robot)
+
+    def tenant(self, tenant: str) -> TenantAccount:
+        """Return the account of a tenant."""
+        return self._get_or_make(
+            self._tenants, tenant,
+            lambda: TenantAccount(
+                self._store, tenant, self._settings, wall_clock=self._wall_clock, check=self._check
+            ),
+        )  # fmt: skip
+
+    def _account(self, robot: RobotId) -> _RobotAccount:
+        return self._get_or_make(self._robots, robot, _RobotAccount)
+
+    def _get_or_make(self, accounts: OrderedDict[_K, _T], key: _K, make: Callable[[], _T]) -> _T:
+        with self._lock:
+            account = accounts.get(key)
+            if account is None:
+                account = accounts[key] = make()
+            accounts.move_to_end(key)
+            if len(accounts) > _MAX_ACCOUNTS:
+                accounts.popitem(last=False)
+            return account
+
+    def _count_if_old(self, account: _RobotAccount, robot: RobotId) -> None:
+        now = self._clock()
+        if now - account.counted_s >= self._recount_s:
+            total = self._store.usage(f"objects/{robot.folder}/")
+            total += _uploads(self._store, f"{robot.folder}/", self._check)
+            account.stored = total + sum_charges(self._store, robot, self._check)
+            account.counted_s = now
+
+    def _check_robot(self, robot: RobotId, used: Usage, charge: Usage, max_bytes: float | None) -> None:
+        most, name = self._settings.quota_bytes, "data.quota_bytes"
+        if max_bytes is not None:
+            most, name = int(max_bytes), "its own quota"
+        if used.objects + charge.objects > self._settings.max_objects:
+            raise QuotaExceeded(
+                f"this robot has {used.objects} objects, the limit is {self._settings.max_objects}",
+                hint="delete objects, or raise data.max_objects",
+            )
+        if used.charged_bytes + charge.charged_bytes > most:
+            raise QuotaExceeded(
+                f"this robot stores {used.charged_bytes} bytes; {charge.charged_bytes} more are above {name} "
+                f"{most}; a short object counts as {MIN_CHARGE_BYTES}",
+                hint=f"delete objects, or raise the quota: rse-pf robot quota {robot.name} "
+                f"--tenant {robot.tenant} --quota data_bytes=N",
+            )
+
+
+def _recount_s(store: ObjectStore) -> float:
+    return _RECOUNT_S if isinstance(store, DirectoryStore) else _SLOW_RECOUNT_S
+
+
+def _subtract(usage: Usage, charge: Usage) -> Usage:
+    return Usage(max(0, usage.objects - charge.objects), max(0, usage.charged_bytes - charge.charged_bytes))
