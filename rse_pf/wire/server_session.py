@@ -224,21 +224,21 @@ class ServerSession:
             case _:
                 return self._renew(message.token, now)
 
-    def move(self, reason: str, within_ms: float) -> list[Decision]:
+    def move(self, reason: str, within_ms: float) -> list[Send]:
         """Ask the robot to connect to another server before it closes this connection."""
         return [self._send(Move(reason=reason, within_ms=within_ms))] if self.state == "open" else []
 
-    def answer_renewal(self, token_s: float | None) -> list[Decision]:
+    def answer_renewal(self, token_s: float | None) -> Send:
         """Answer a `Renewal`: the connection lasts *token_s* longer, or (None) the token was refused.
 
         A refusal tells no cause, as in the handshake, and the connection keeps its previous expiry.
         """
         if token_s is not None:
-            return [self._send(Renewed(token_s=token_s))]
+            return self._send(Renewed(token_s=token_s))
         error = Unauthorized(
             "the fresh token is not valid for this robot", hint="the connection keeps its previous expiry"
         )
-        return [self._send(self._failure(error))]
+        return self._send(self._failure(error))
 
     def refuse_updates(self, identity: int, error: RsePfError) -> Send:
         """End the subscription *identity* because of *error*, and return the message that says so."""

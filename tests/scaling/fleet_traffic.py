@@ -61,7 +61,7 @@ def measure_traffic(robots: Sequence[Robot], periods: int) -> list[Traffic]:
                 worker.say(connection, Command(id=period + 1, service=service, payload={"value": 1}))
                 worker.loop.advance()
                 if not robot.stays:
-                    connection.on_socket_end()
+                    worker.dispatcher.disconnect(connection)
             merged = merge([worker.dispatcher.snapshot()])
             now, requests = read_page(render(merged).decode()), sum(count for *_, count in merged["requests"])
             points = {

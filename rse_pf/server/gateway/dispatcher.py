@@ -1,7 +1,11 @@
-"""Bring the commands of all connections of one worker to their queues.
+"""Receive the messages of all connections of one worker, and pass their commands to queues.
 
-Frames come in through `RobotConnection.receive_frame`, and bytes leave through a `Wire`: no socket library
-is known here.  Each queue (`CommandQueue`) answers what it took.
+1. `_refuse_unread`: the robot's rate and the backlog of the server are checked before a message is decoded.
+2. `_receive`: a short message is decoded in the event loop, a long one in the decoder thread.
+3. `_execute`: what the session decided about the message is done.
+4. `submit`: a command is admitted or refused, and the first queue that offers its service answers it.
+
+No socket library is known here: `RobotConnection` gives messages, and writes through a `Wire`.
 """
 
 from __future__ import annotations
@@ -10,7 +14,9 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from rse_pf.errors import Busy, NotFound, UnknownService
+from msgspec import Struct
+
+from rse_pf.errors import Busy, NotFound, ProtocolError, UnknownService
 from rse_pf.server.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
 from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.connection import RobotConnection
@@ -25,14 +31,34 @@ from rse_pf.server.ports import Wire, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue
 from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.services.pnp_reader import pnp_reader
-from rse_pf.wire import CODECS, Codec, Command, Failure
+from rse_pf.wire import CODECS, Codec, Command
 from rse_pf.wire.envelope import peek
+from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_codec import make_server_codec
-from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
+from rse_pf.wire.server_session import (
+    CLOSE_GOING_AWAY,
+    CLOSE_RATE,
+    MAX_BAD_MESSAGES,
+    BeginUpdates,
+    Close,
+    Decision,
+    EndUpdates,
+    Renewal,
+    Send,
+    SendRefusal,
+    ServerSession,
+    Submit,
+    Withdraw,
+)
 
 __all__ = ["Dispatcher"]
 
+# Pause before a refused long message is sent again: one that inflates to the limit is decoded within it.
 _DECODER_RETRY_MS = 500.0
+# A socket is not read for this time, multiplied by the number of its messages that could not be decoded.
+_BAD_MESSAGE_PAUSE_S = 0.1
+# Bad messages with a readable id that count for the pause: clients take 1 s of silence for a lost connection.
+_MAX_REFUSED = 5
 _NO_JOBS = {"jobs": 0.0, "jobs_pending": 0.0}
 """Alarms read these gauges of every server."""
 
@@ -110,7 +136,9 @@ class Dispatcher:
             session.ends_s = expires_s
             session.tenant = accepted.robot.tenant
             session.scopes = () if accepted.claims is None else accepted.claims.scopes
-        connection = RobotConnection(self, wire, session, accepted, now=now, number=number)
+        connection = RobotConnection(
+            self.context, wire, session, accepted, receive=self._receive, now=now, number=number
+        )
         self.connections.add(connection)
         self._token_watch.watch(connection, expires_s)
         for queue in self._queues:
@@ -122,7 +150,8 @@ class Dispatcher:
         self.context.log.error("defect", traceback=text)
 
     def disconnect(self, connection: RobotConnection) -> None:
-        """Forget a connection whose socket ended, and what it still waited for."""
+        """Forget a connection whose socket ended, and its commands that wait."""
+        connection.end()
         self._token_watch.forget(connection)
         if connection in self.connections:
             self.connections.discard(connection)
@@ -134,7 +163,7 @@ class Dispatcher:
         if connection.is_shown:
             self.context.log.info("robot-offline", robot=connection.robot)
 
-    def greet(self, connection: RobotConnection, now: float) -> None:
+    def _greet(self, connection: RobotConnection, now: float) -> None:
         """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
         if connection.is_shown:
             self.context.log.info("robot-online", robot=connection.robot)
@@ -159,7 +188,31 @@ class Dispatcher:
         for queue in self._queues:
             queue.close()
 
-    def refuse_unread(
+    def _receive(self, connection: RobotConnection, session: ServerSession, data: bytes, now: float) -> None:
+        """Refuse one whole message, decode it at once, or pass it to the decoder thread."""
+        if session.state == "open" and self._refuse_unread(connection, session, data, now):
+            return
+        state, suspicion = session.state, session.suspicion
+        decoder, decisions = self.decoder, None
+        if len(data) <= decoder.short_bytes:
+            decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
+        if decisions is not None and len(decisions) == 1 and type(decisions[0]) is Submit:
+            command = decisions[0].command
+            tap = connection.tap
+            if tap is not None and isinstance(command.payload, Struct):
+                # The codec decodes a payload to a request only if it knows all fields of the message.
+                tap.is_plain(data, command.id, f"{command.stream} {command.trace}")
+            self.submit(connection, command, len(data), now)
+        elif decisions is not None:
+            self._follow(connection, session, decisions, len(data), now, state, suspicion)
+        elif self.admission.may_wait(len(data), decoder.unread_bytes, suspicion):
+            self._decode_in_thread(connection, session, data, now)
+        else:
+            self._answers.refuse_unread(
+                connection, peek(session.codec, data), len(data), DECODER_FULL, _DECODER_RETRY_MS
+            )
+
+    def _refuse_unread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> bool:
         """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
@@ -189,17 +242,67 @@ class Dispatcher:
         answers.refuse_unread(connection, envelope, len(data), TOO_LATE, 1e3 * pause_s)
         return True
 
-    def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
-        """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
-        may_wait = self.admission.may_wait(len(data), self.decoder.unread_bytes, session.suspicion)
-        if not may_wait:
-            envelope = peek(session.codec, data)
-            self._answers.refuse_unread(connection, envelope, len(data), DECODER_FULL, _DECODER_RETRY_MS)
-        return not may_wait
+    def _decode_in_thread(
+        self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
+    ) -> None:
+        state, suspicion = session.state, session.suspicion
 
-    def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
-        """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
-        self._answers.note_undecoded(connection, failure, size_bytes)
+        def follow_decoded(message: FromRobot | ProtocolError) -> None:
+            decisions = session.take(message, now, data)
+            self._follow(connection, session, decisions, len(data), now, state, suspicion)
+
+        connection.defer()
+        self.decoder.begin(
+            session.codec, data, number=connection.number, suspicion=suspicion,
+            done=lambda message: connection.resume(lambda: follow_decoded(message)),
+        )  # fmt: skip
+
+    def _follow(
+        self,
+        connection: RobotConnection,
+        session: ServerSession,
+        decisions: list[Decision],
+        size_bytes: int,
+        now: float,
+        state: str,
+        suspicion: int,
+    ) -> None:
+        """Execute what the session decided about one message; *state* and *suspicion* are those before it."""
+        for decision in decisions:
+            self._execute(connection, decision, size_bytes, now)
+        if session.bad_messages > MAX_BAD_MESSAGES:
+            self.context.log.warning("cut-off", robot=connection.robot, reason="bad-messages")
+            self.rates.ban(connection.robot, now)
+        if connection.is_closing:
+            return
+        if session.suspicion > suspicion:
+            # Refusing a bad message costs as much as reading it, so the socket is read more and more rarely.
+            self.context.metrics.shed["bad-message"] += 1
+            counted = session.bad_messages + min(session.refused_commands, _MAX_REFUSED)
+            connection.read_rarely(counted * _BAD_MESSAGE_PAUSE_S)
+        elif state == "opening" and session.state == "open":
+            self._greet(connection, now)
+
+    def _execute(self, connection: RobotConnection, decision: Decision, size_bytes: int, now: float) -> None:
+        match decision:
+            case Submit():
+                self.submit(connection, decision.command, size_bytes, now)
+            case Send():
+                connection.write(decision.data)
+                if isinstance(decision, SendRefusal):
+                    self._answers.note_undecoded(connection, decision.failure, size_bytes)
+            case Renewal():
+                self._token_watch.renew(connection, decision.token)
+            case Withdraw():
+                for queue in self._queues:
+                    queue.withdraw(connection, decision.id)
+            case Close():
+                connection.close(decision.code, decision.reason)
+            case BeginUpdates():
+                self._subscribe(connection, decision.id, decision.topic)
+            case EndUpdates():
+                if self._updates is not None:
+                    self._updates.unsubscribe(connection, decision.id)
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
         """Admit one command to the queue of its service, or refuse it."""
@@ -231,27 +334,13 @@ class Dispatcher:
         else:
             self._answers.send(self._answers.compute(queued), now)
 
-    def withdraw(self, connection: RobotConnection, command_id: int) -> None:
-        """Cancel a command in the queue that has it."""
-        for queue in self._queues:
-            queue.withdraw(connection, command_id)
-
-    def subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
+    def _subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
         """Begin the updates of *topic* for the subscription *identity*, or refuse it."""
         if self._updates is not None:
             self._updates.subscribe(connection, identity, topic)
         else:
             error = NotFound("this server offers no updates", hint="the operator has switched live maps off")
             connection.refuse_updates(identity, error)
-
-    def unsubscribe(self, connection: RobotConnection, identity: int) -> None:
-        """End a subscription."""
-        if self._updates is not None:
-            self._updates.unsubscribe(connection, identity)
-
-    def renew(self, connection: RobotConnection, token: str) -> None:
-        """Judge a fresh token of a live connection."""
-        self._token_watch.renew(connection, token)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the numbers of this worker for /metrics and /status."""

@@ -117,7 +117,7 @@ class TokenWatch:
             reason = claims if isinstance(claims, str) else "wrong-robot"
             self._context.log.info("renewal-refused", robot=connection.robot, reason=reason)
             self._recorder.record_refused_renewal(before, reason)
-        connection.answer_renewal(token_s, now)
+        connection.answer_renewal(token_s)
 
     def _end_at(self, connection: RobotConnection, expires_s: float | None) -> None:
         timer = self._timers.pop(connection, None)

@@ -448,7 +448,7 @@ class Listener(picows.WSListener):  # type: ignore[misc]
             if timer is not None:
                 timer.cancel()
         if self._connection is not None:
-            self._connection.on_socket_end()
+            self._dispatcher.disconnect(self._connection)
             self._connection = None
 
     def pause_writing(self) -> None:

@@ -96,7 +96,7 @@ def test_a_long_command_of_a_robot_that_left_meanwhile_is_dropped(worker: Worker
     connection, wire = worker.join()
 
     worker.say(connection, LONG)
-    connection.on_socket_end()
+    worker.dispatcher.disconnect(connection)
     worker.loop.run_until(lambda: wire.holds == 0)
 
     assert answered(wire) == []
@@ -123,7 +123,7 @@ def test_an_answer_is_written_once_and_only_while_the_socket_exists(worker: Work
     connection.session.in_flight = 2
 
     connection.answer(answer, 1)
-    connection.on_socket_end()
+    worker.dispatcher.disconnect(connection)
     connection.answer(answer, 1)
 
     assert answered(wire) == [1]

@@ -418,8 +418,8 @@ def test_each_queue_learns_of_connections_withdrawals_and_the_end_of_the_server(
         worker.say(connection, Cancel(id=7))
         report = worker.dispatcher.snapshot()
         worker.dispatcher.move_all("drain", 500.0)
-        connection.on_socket_end()
-        connection.on_socket_end()
+        worker.dispatcher.disconnect(connection)
+        worker.dispatcher.disconnect(connection)
 
     for queue in queues:
         assert queue.told == [
@@ -488,7 +488,7 @@ def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
     worker.say(other, half(2))
     worker.say(connection, echo(2))
 
-    connection.on_socket_end()
+    worker.dispatcher.disconnect(connection)
     worker.loop.advance()
 
     assert worker.metrics.requests["echo", "disconnected"] == 1

@@ -46,7 +46,7 @@ def test_a_robot_that_left_is_held_by_nothing(leave: Callable[[WorkerParts, Robo
         def cycle() -> None:
             connection, _ = parts.join("r", expires_s=2e6)
             leave(parts, connection)
-            connection.on_socket_end()
+            parts.dispatcher.disconnect(connection)
 
         cycle()
         parts.loop.advance(1.0)

@@ -123,7 +123,7 @@ def test_the_end_of_a_connection_ends_its_subscriptions(worker: Worker) -> None:
     connection, _ = worker.subscriber()
     worker.say(connection, Subscribe(id=4, topic="live/m"))
 
-    connection.on_socket_end()
+    worker.dispatcher.disconnect(connection)
 
     assert worker.client.unwatched == [("default", "m")]
     worker.tell(1)
