@@ -13,16 +13,16 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+from rse_pf.cli.options import Parser, add_action, add_settings, perform
 from rse_pf.config import load_settings
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
 from rse_pf.processes.one_thread import ONE_THREAD
 from rse_pf.terminal import show, show_error, show_page
 
-__all__ = ["VERBS", "Parser", "main", "parser_of", "verb_module"]
+__all__ = ["VERBS", "main", "parser_of", "verb_module"]
 
 VERBS = {
     "demo": "let robots build point-cloud maps through the platform, on this machine",
@@ -63,53 +63,6 @@ _FOLDERS = {
 
 _EXIT_OK, _EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED, _EXIT_PIPE = 0, 1, 2, 130, 141
 _REFUSED = re.compile(r"[a-z]+\.(?P<name>[a-z_]+) = .* is (below|above|not one of) ")
-_CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known>.*)\)")
-
-
-class Parser(argparse.ArgumentParser):
-    """Raises UsageError instead of printing a page and leaving."""
-
-    typed: Sequence[str] = ()
-    """The words that are parsed."""
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Keep the words, for the explanation of an error."""
-        self.typed = sys.argv[1:] if args is None else args
-        return super().parse_known_args(args, namespace)
-
-    def error(self, message: str) -> NoReturn:
-        """Raise what is wrong, with the option or word that was perhaps meant."""
-        choice = _CHOICE.search(message)
-        if choice:
-            known = [word.strip(" '\"") for word in choice["known"].split(",")]
-            raise UsageError(
-                f"{self.prog}: {choice['word']!r} is not one of {', '.join(known)}",
-                hint=did_you_mean(choice["word"], known, f"see {self.prog} --help"),
-            )
-        known = [word for action in self._actions for word in action.option_strings]
-        unknown = re.search(r"unrecognized arguments: ([^\s=]*)", message)
-        option = unknown[1] if unknown else ""
-        if "arguments are required" in message:  # perhaps only for an option that does not exist
-            options = (word.partition("=")[0] for word in self.typed if word.startswith("--"))
-            ours = {word for parser in (self, *self._actions_of()) for word in parser._option_string_actions}
-            option = next((word for word in options if word.strip("-") and word not in ours), "")
-        if option and not option.startswith("-"):
-            raise UsageError(
-                f"{self.prog}: {message}",
-                hint=f"leave it out, or put it before the options; see {self.prog} --help",
-            )
-        raise UsageError(
-            f"{self.prog}: unknown option {option}" if option else f"{self.prog}: {message}",
-            hint=did_you_mean(option, known, f"see {self.prog} --help"),
-        )
-
-    def _actions_of(self) -> list[argparse.ArgumentParser]:
-        return [
-            each
-            for action in self._actions
-            if isinstance(action, argparse._SubParsersAction)
-            for each in action.choices.values()
-        ]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -158,10 +111,11 @@ def parser_of(name: str) -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument(
-        "--settings", type=Path, metavar="FILE", help="read settings from FILE (default: ./cdk.json, if any)"
-    )
-    verb.add_arguments(parser)
+    add_settings(parser)
+    if hasattr(verb, "ACTION"):
+        add_action(parser, verb.ACTION)
+    else:
+        verb.add_arguments(parser)
     return parser
 
 
@@ -185,7 +139,8 @@ def _run(words: list[str]) -> int:
     except SystemExit as over:  # --help has printed its page
         return int(over.code or _EXIT_OK)
     try:
-        code: int = verb.run(args, load_settings(args.settings))
+        settings = load_settings(args.settings)
+        code: int = perform(args, settings) if hasattr(verb, "ACTION") else verb.run(args, settings)
     except SettingsError as error:
         error.hint = _hint_for_option(error, rest)
         raise

@@ -1,0 +1,196 @@
+"""Options of the command line as typed requests: frozen dataclasses whose fields declare the options.
+
+An `Action` names the request of a verb, or of one action of it, and the function that takes the request::
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class PruneRequest(MapRequest):
+        keep: int = option("--keep", required=True, metavar="N", help="number of newest versions to keep")
+
+    ACTION = Action(request=PruneRequest, run=prune)
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rse_pf.config.validation import did_you_mean
+from rse_pf.errors import UsageError
+
+__all__ = ["Action", "Parser", "add_action", "option", "perform"]
+
+_CONVERTERS: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Path": Path}
+"""Function that reads the text of an option, by the first type in the annotation of its field."""
+_HELP = (["-h"], ["--help"])
+_CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known>.*)\)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Action:
+    """A verb, or one action of a verb: either a request and the function that takes it, or further actions.
+
+    ``run`` takes the request and the settings, and returns the exit code; None means 0.  ``default`` names
+    the action of a verb that is meant if none is named.  ``description`` opens the help page of the action;
+    without one it is ``help``, the line in the list of actions.
+    """
+
+    help: str = ""
+    description: str = ""
+    example: str = ""
+    request: Any = None
+    run: Callable[[Any, Any], int | None] | None = None
+    actions: Mapping[str, Action] = field(default_factory=dict)
+    default: str = ""
+
+
+def option(*flags: str, default: Any = None, section: str = "", exclusive: str = "", **keywords: Any) -> Any:
+    """Return a field of a request that is read from the command line, by default as a positional argument.
+
+    The annotation of the field gives the type of the value; ``bool`` is a flag that takes no value.
+
+    Args:
+        flags: Names such as ``--out``; none for a positional argument, which has the name of the field.
+        default: Value of an option that is not given.
+        section: Heading under which the help page lists the option.
+        exclusive: At most one of the options with the same word here may be given.
+        keywords: Further arguments of `argparse.ArgumentParser.add_argument`.
+    """
+    return field(
+        default=default,
+        metadata={"flags": flags, "section": section, "exclusive": exclusive, "keywords": keywords},
+    )
+
+
+class Parser(argparse.ArgumentParser):
+    """Raises UsageError where `argparse.ArgumentParser` prints an error and exits."""
+
+    typed: Sequence[str] = ()
+    """The words that are parsed."""
+
+    siblings: Mapping[str, Parser] = {}
+    """The parsers of all actions of the verb, by name."""
+
+    default_action: str = ""
+    """The action that is meant if the first word names none."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse all words, and refuse what this parser does not know, also as the parser of an action."""
+        words = list(sys.argv[1:] if args is None else args)
+        if self.default_action and (not words or words[0].startswith("-")) and words[:1] not in _HELP:
+            words = [self.default_action, *words]
+        self.typed = words
+        parsed, unknown = super().parse_known_args(words, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what is wrong, with the option or word that was perhaps meant."""
+        choice = _CHOICE.search(message)
+        if choice:
+            known = [word.strip(" '\"") for word in choice["known"].split(",")]
+            raise UsageError(
+                f"{self.prog}: {choice['word']!r} is not one of {', '.join(known)}",
+                hint=did_you_mean(choice["word"], known, f"see {self.prog} --help"),
+            )
+        unknown = re.search(r"unrecognized arguments: ([^\s=]*)", message)
+        word = unknown[1] if unknown else ""
+        if "arguments are required" in message:  # perhaps because of an option that does not exist
+            options = {*self._option_string_actions, *self._options_of_actions()}
+            typed = (each.partition("=")[0] for each in self.typed if each.startswith("--"))
+            word = next((each for each in typed if each.strip("-") and each not in options), "")
+        if word and not word.startswith("-"):
+            raise UsageError(
+                f"{self.prog}: {message}",
+                hint=f"leave it out, or put it before the options; see {self.prog} --help",
+            )
+        raise UsageError(
+            f"{self.prog}: unknown option {word}" if word else f"{self.prog}: {message}",
+            hint=self._hint_for(word),
+        )
+
+    def _hint_for(self, option: str) -> str:
+        others = [name for name, parser in self.siblings.items() if option in parser._option_string_actions]
+        if option and others:
+            return f"{option} is an option of {', '.join(others)}; see {self.prog} --help"
+        return did_you_mean(option, self._option_string_actions, f"see {self.prog} --help")
+
+    def _options_of_actions(self) -> set[str]:
+        actions = [each for each in self._actions if isinstance(each, argparse._SubParsersAction)]
+        parsers = [parser for each in actions for parser in each.choices.values()]
+        return {word for parser in parsers for word in parser._option_string_actions}
+
+
+def add_action(parser: Parser, action: Action) -> None:
+    """Declare the options of an action, or the parsers of its actions with theirs."""
+    if not action.actions:
+        _add_options(parser, action.request)
+        parser.set_defaults(chosen=action)
+        return
+    parser.default_action = action.default
+    subparsers = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    for name, each in action.actions.items():
+        made = subparsers.add_parser(
+            name,
+            help=each.help,
+            description=each.description or f"{each.help[:1].upper()}{each.help[1:]}.",
+            epilog=f"example:\n  {each.example}" if each.example else None,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        add_settings(made, default=argparse.SUPPRESS)
+        add_action(made, each)
+        made.siblings = subparsers.choices
+
+
+def add_settings(parser: Parser, default: Any = None) -> None:
+    """Declare the option that names the file of settings."""
+    parser.add_argument(
+        "--settings",
+        type=Path,
+        default=default,
+        metavar="FILE",
+        help="read settings from FILE (default: ./cdk.json, if it exists)",
+    )
+
+
+def perform(parsed: argparse.Namespace, settings: Any) -> int:
+    """Build the request of the action that was parsed, run the action, and return its exit code."""
+    action: Action = parsed.chosen
+    assert action.run is not None
+    given = vars(parsed)
+    values = {each.name: given[each.name] for each in fields(action.request) if each.name in given}
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return action.run(action.request(**values), settings) or 0
+
+
+def _add_options(parser: Parser, request: Any) -> None:
+    groups: dict[str, Any] = {}
+    for each in fields(request):
+        if "flags" not in each.metadata:
+            continue
+        section, exclusive = each.metadata["section"], each.metadata["exclusive"]
+        if section and section not in groups:
+            groups[section] = parser.add_argument_group(section)
+        if exclusive and exclusive not in groups:
+            groups[exclusive] = groups.get(section, parser).add_mutually_exclusive_group()
+        _add_option(groups.get(exclusive or section, parser), each)
+
+
+def _add_option(group: Any, declared: Field[Any]) -> None:
+    flags, keywords = declared.metadata["flags"], dict(declared.metadata["keywords"])
+    kind = re.match(r"(?:tuple\[)?(\w*)", str(declared.type))
+    converter = None if kind is None else _CONVERTERS.get(kind[1])
+    default = list(declared.default) if isinstance(declared.default, tuple) else declared.default
+    if kind is not None and kind[1] == "bool" and "action" not in keywords:
+        keywords["action"] = "store_true" if default is not True else "store_false"
+    elif converter is not None:
+        keywords["type"] = converter
+    if flags:
+        keywords["dest"] = declared.name
+    group.add_argument(*(flags or (declared.name,)), default=default, **keywords)
