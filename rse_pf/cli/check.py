@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 from client_sdk.check.drive_check import check_lines
 from client_sdk.source_facts import DoubtLog, check_accepted, ended_early, unresolved
-from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_accept_argument, add_sensor_arguments, show_source
+from rse_pf.command_line.extras import require
+from rse_pf.command_line.sensors import add_accept_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.storage.files import read_document, replace_file

@@ -19,8 +19,8 @@ import math
 from pathlib import Path
 
 from client_sdk.source_facts import check_accepted
-from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_accept_argument, add_sensor_arguments
+from rse_pf.command_line.extras import require
+from rse_pf.command_line.sensors import add_accept_argument, add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 

@@ -18,8 +18,8 @@ import math
 from pathlib import Path
 
 from client_sdk.source_facts import check_accepted, unresolved
-from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_source
+from rse_pf.command_line.extras import require
+from rse_pf.command_line.sensors import add_check_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.recording.writer import with_recordings

@@ -19,8 +19,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rse_pf.cli.extras import EXTRAS, VERBS_NEED, modules_of
-from rse_pf.cli.packages import Defect, find_defect
+from rse_pf.command_line.extras import EXTRAS, VERBS_NEED, modules_of
+from rse_pf.command_line.packages import Defect, find_defect
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.native import load_core

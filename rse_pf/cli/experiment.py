@@ -23,7 +23,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from rse_pf.cli.sensors import add_sensor_arguments
+from rse_pf.command_line.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show

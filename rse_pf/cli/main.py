@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from rse_pf.cli.options import Parser, add_action, add_settings, perform
+from rse_pf.command_line.options import Parser, add_action, add_settings, perform
 from rse_pf.config import load_settings
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
@@ -180,7 +180,7 @@ def _version() -> str:
 
 def _missing_extra(error: ModuleNotFoundError) -> RsePfError:
     """Return which extra lacks; raises *error* itself if the module belongs to none: that is a defect."""
-    from rse_pf.cli.extras import extra_of_module
+    from rse_pf.command_line.extras import extra_of_module
 
     missing = extra_of_module(error.name or "")
     if missing is None:

@@ -20,7 +20,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rse_pf.cli.extras import require
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import at_work, counted, show, show_json

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from rse_pf.cli.extras import require
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import UsageError
 

@@ -13,7 +13,7 @@ from client_sdk.check.drive_check import DriveCheck, check_lines
 from client_sdk.check.findings import FaultKind, Finding
 from client_sdk.rigs.intrinsics import Intrinsics
 from rse_pf.cli.main import main
-from rse_pf.cli.sensors import add_check_argument
+from rse_pf.command_line.sensors import add_check_argument
 from rse_pf.geometry import Camera
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)

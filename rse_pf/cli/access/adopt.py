@@ -17,7 +17,7 @@ from pathlib import Path
 from rse_pf.auth.roster import ROBOT_KEY, Roster
 from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.access.access_control import described
-from rse_pf.cli.maps.map_store import with_store
+from rse_pf.command_line.map_store import with_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId

@@ -28,7 +28,7 @@ from rse_pf.cli.access.access_control import (
     read_quotas,
     record_action,
 )
-from rse_pf.cli.maps.map_store import with_store
+from rse_pf.command_line.map_store import with_store
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError

@@ -17,8 +17,8 @@ from __future__ import annotations
 import argparse
 import os
 
-from rse_pf.cli.extras import require
 from rse_pf.cli.local_platform.local import DEFAULT_NAME
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json

@@ -37,7 +37,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rse_pf.cli.extras import require
+from rse_pf.command_line.extras import require
 from rse_pf.config import HealthSettings, PlatformSettings
 from rse_pf.config.resource_names import ROBOTS_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import UsageError

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rse_pf.aws.storage import open_data_store
-from rse_pf.cli.maps.map_store import open_maps
+from rse_pf.command_line.map_store import open_maps
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.maps.backup import BackupContent, CheckedBackup, check_backup, restore_backup, write_backup

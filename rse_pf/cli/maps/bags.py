@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rse_pf.cli.extras import require
 from rse_pf.cli.maps.from_camera import add_drive_arguments, check_drive, errors_of, map_source
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import at_work, counted, show

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rse_pf.cli.extras import require
 from rse_pf.cli.maps.frame_table import named_frames
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_progress

@@ -21,8 +21,8 @@ from client_sdk.check.drive_check import DriveCheck
 from client_sdk.source_facts import check_accepted, ended_early, unresolved
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.cli.maps.keyframe_images import KeyframeImages
-from rse_pf.cli.maps.map_store import add_keep_arguments, drive_store, keep_map, map_name
-from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_source
+from rse_pf.command_line.map_store import add_keep_arguments, drive_store, keep_map, map_name
+from rse_pf.command_line.sensors import add_check_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.identity import DEFAULT_TENANT

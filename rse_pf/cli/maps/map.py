@@ -41,8 +41,8 @@ from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, export_bag, run_b
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
 from rse_pf.cli.maps.localise import add_localise_arguments, is_remote, localise_frames, localise_photos
-from rse_pf.cli.maps.map_store import open_maps, with_store
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
+from rse_pf.command_line.map_store import open_maps, with_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
 from rse_pf.extensions.map_export.command import add_export_arguments, run_export

@@ -10,8 +10,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from rse_pf.cli.extras import require
 from rse_pf.cli.services.building import built_service
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError

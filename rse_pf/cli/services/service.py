@@ -41,12 +41,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rse_pf.cli.extras import require
 from rse_pf.cli.local_platform.logs import LogFollower, LogLine
 from rse_pf.cli.services.blocks import add_block_arguments, show_blocks, unblock
 from rse_pf.cli.services.building import build_service, built_service, changed_s, lock_service
 from rse_pf.cli.services.publishing import add_publish_arguments, publish_service
 from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay
+from rse_pf.command_line.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from rse_pf.cli import extras
-from rse_pf.cli.extras import EXTRAS, VERBS_NEED, extra_of_module, modules_of, require
 from rse_pf.cli.main import VERBS, main
+from rse_pf.command_line.extras import EXTRAS, VERBS_NEED, extra_of_module, modules_of, require
 from rse_pf.errors import MissingExtra
 
 if sys.version_info >= (3, 11):

@@ -9,7 +9,7 @@ import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rse_pf.cli.packages import Defect, find_defect, find_misuse
+from rse_pf.command_line.packages import Defect, find_defect, find_misuse
 from rse_pf.errors import ConfigurationError, MissingExtra
 
 __all__ = ["EXTRAS", "VERBS_NEED", "Extra", "extra_of_module", "modules_of", "require"]
