@@ -25,7 +25,7 @@ from rse_pf.slam.keyframe import (
 )
 from rse_pf.slam.localise import LocalisationCandidate, localise
 from rse_pf.slam.place_recognition import place_vector
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 __all__ = ["live"]
 

@@ -25,7 +25,7 @@ from rse_pf.server.sandbox.replies import outcome_of
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Command, Failure, Result, make_codec
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 __all__ = ["cloud", "graph", "keyframes", "maps", "snapshots"]
 

@@ -23,8 +23,8 @@ from rse_pf.services.pnp import make_request
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe
 from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
-from tests.synthetic_maps import make_room, make_sphere, make_world
-from tests.two_views import make_two_views
+from tests.kit.synthetic_maps import make_room, make_sphere, make_world
+from tests.kit.two_views import make_two_views
 
 __all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]
 

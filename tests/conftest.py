@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import is_localstack
 from hypothesis import settings
 from localstack.lacking import LACKING
 
 from rse_pf.processes.one_thread import ONE_THREAD
+from tests.kit.emulated_aws import is_localstack
 
 # Before numpy is imported.  BLAS' threads wait for each other where tests share the processors: a test of 6 s
 # took more than 120.

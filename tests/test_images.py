@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from hostile.hostile_images import HARMLESS, chunk, hostile_images, photo, png  # noqa: E402
-
 from rse_pf import images  # noqa: E402
 from rse_pf.errors import BadRequest, LimitExceeded  # noqa: E402
 from rse_pf.images import MAX_PHOTO_PIXELS, decode_photo, photo_size  # noqa: E402
+from tests.kit.hostile_images import HARMLESS, chunk, hostile_images, photo, png  # noqa: E402
 
 IMAGES = hostile_images()
 ADAM7 = (

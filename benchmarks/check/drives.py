@@ -16,7 +16,7 @@ from client_sdk.imu.samples import ImuModel
 from client_sdk.simulator import loop_trajectory, make_world, render_along, render_pairs
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, exp_se3, inverse
-from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion
+from tests.kit.inertial_drive import InertialDrive, Motion
 
 __all__ = ["CheckedDrive", "recorded_drive", "rendered_drive"]
 

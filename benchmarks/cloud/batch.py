@@ -37,7 +37,7 @@ from rse_pf.processes.one_thread import ONE_THREAD
 from rse_pf.slam.cloud_deform import deform_cloud
 from rse_pf.slam.loop_closures import Atlas, MergeOptions, measure_pairs
 from rse_pf.storage.object_store import DirectoryStore, digest_of
-from tests.batch.in_process import InProcessEngine
+from tests.kit.in_process_engine import InProcessEngine
 
 __all__ = ["kitchen", "noisy_copy"]
 

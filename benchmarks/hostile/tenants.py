@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.server.serving import BenchServer
-from tests.hostile.identity import tenants
+from tests.kit import tenants
 
 
 @benchmark(

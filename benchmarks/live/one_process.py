@@ -40,7 +40,7 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe
-from tests.live_map.generated_drives import (
+from tests.kit.generated_drives import (
     STEP_M,
     GeneratedDrive,
     GeneratedWorld,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from emulated_aws import REGION, emulated_aws
+
+from tests.kit.emulated_aws import REGION, emulated_aws
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from rse_pf.extensions.batch.parts import Part
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.slam.map_merge import Atlas, MergeOptions, merge_versions, propose_loop_closures
 from rse_pf.storage.object_store import DirectoryStore
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow
 

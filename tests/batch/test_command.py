@@ -18,7 +18,7 @@ import pytest
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from rse_pf.extensions.batch.icp_tiles import align_tiles
 from rse_pf.geometry import Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.loop_closures import Atlas
-from tests.synthetic_maps import make_room
+from tests.kit.synthetic_maps import make_room
 
 pytest.importorskip("small_gicp", reason="the extra maps is not installed")
 

@@ -18,8 +18,8 @@ from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_loop_closures
 from rse_pf.storage.object_store import MemoryStore
-from tests.batch.in_process import InProcessEngine
-from tests.synthetic_maps import make_world
+from tests.kit.in_process_engine import InProcessEngine
+from tests.kit.synthetic_maps import make_world
 
 pytest.importorskip("gtsam", reason="the extra maps is not installed")
 

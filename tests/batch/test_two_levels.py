@@ -9,7 +9,7 @@ from rse_pf.extensions.batch.two_levels import graph_between, graphs_within, pos
 from rse_pf.geometry import exp_se3
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph, robust_cost
 from rse_pf.slam.pose_graph import PoseGraph
-from tests.synthetic_maps import make_sphere
+from tests.kit.synthetic_maps import make_sphere
 
 pytest.importorskip("gtsam", reason="the extra maps is not installed")
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import REGION, emulated_aws
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.local.firewall import ensure_key
+from tests.kit.emulated_aws import REGION, emulated_aws
 
 
 @pytest.fixture

@@ -131,7 +131,7 @@ def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
 ) -> None:
     pytest.importorskip("cv2")
     from client_sdk.simulator import render_frames, true_trajectory
-    from tests.tum_recording import write_tum
+    from tests.kit.tum_recording import write_tum
 
     write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
 
@@ -150,7 +150,7 @@ def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
 def test_odometry_beside_the_images_knows_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("cv2")
     from client_sdk.simulator import render_frames, true_trajectory
-    from tests.tum_recording import write_tum
+    from tests.kit.tum_recording import write_tum
 
     write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
     (tmp_path / "groundtruth.txt").rename(tmp_path / "odometry.txt")
@@ -166,7 +166,7 @@ def test_nothing_is_advised_while_the_source_has_a_finding(
 ) -> None:
     pytest.importorskip("cv2")
     from client_sdk.simulator import render_frames, true_trajectory
-    from tests.tum_recording import write_tum
+    from tests.kit.tum_recording import write_tum
 
     write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
     (tmp_path / "rgb/020.png").write_bytes(b"")

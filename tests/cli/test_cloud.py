@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import NoRoom, emulated_aws
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
@@ -18,6 +17,7 @@ from rse_pf.cli.cloud import doctor
 from rse_pf.cli.cloud.doctor import check_tools
 from rse_pf.cli.main import main
 from rse_pf.config.resource_names import STACKS
+from tests.kit.emulated_aws import NoRoom, emulated_aws
 
 REGION = "ap-northeast-2"
 

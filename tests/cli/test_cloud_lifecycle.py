@@ -13,7 +13,7 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.cli.main import main
 from rse_pf.errors import StoreError
-from tests.aws.lifecycle.account_on_moto import Formation, Killer, account_of
+from tests.kit.account_on_moto import Formation, Killer, account_of
 
 REGION = "ap-northeast-2"
 

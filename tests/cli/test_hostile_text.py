@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recording.replay.made import Made
 
 from rse_pf.audit.entry import Entry
 from rse_pf.audit.log import AuditLog, audit_folder
@@ -26,6 +25,7 @@ from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.terminal import printable
 from rse_pf.wire import Failure
+from tests.kit.recorded_sessions import Made
 
 HOSTILE = (
     "r\x1b[2J\x1b]52;c;eA==\x07\x9b31m\u202e\u2066\u200b\ufeff\r\nok: forged\x85\u2028\x00\x7f\U000e0041"

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from documentation_pages import PAGES
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import VERBS, main, parser_of, verb_module
@@ -28,6 +27,7 @@ from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
+from tests.kit.documentation_pages import PAGES
 
 OTHER_PROGRAMS = (
     "npx", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recording.replay.made import Made, jpeg
 
 from rse_pf.cli.main import main
 from rse_pf.extensions.recording.mcap_file import McapFile
 from rse_pf.extensions.recording.replay import limited
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.wire import Result
+from tests.kit.recorded_sessions import Made, jpeg
 
 
 @pytest.fixture(scope="module")

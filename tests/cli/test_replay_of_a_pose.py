@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from recording.replay.made import Made
 
 from rse_pf.cli.main import main
 from rse_pf.pnp.problems import make_degenerate, make_problem
+from tests.kit.recorded_sessions import Made
 
 MATCHES, INLIERS = 60, 12
 BLUE, ORANGE = (0, 114, 178), (213, 94, 0)  # of matches that agree with the pose, and of those that do not

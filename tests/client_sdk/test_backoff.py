@@ -14,7 +14,7 @@ from client_sdk.network.dial_errors import DialError
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.errors import ConnectError
-from tests.played_firewall import PlayedFirewall, rules_of_settings
+from tests.kit.fake_firewall import PlayedFirewall, rules_of_settings
 
 SITE = "203.0.113.7"
 BEGAN_S = 1000.0

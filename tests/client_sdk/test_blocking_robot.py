@@ -17,7 +17,7 @@ import pytest
 
 import client_sdk
 from rse_pf.errors import Disconnected, Expired, RsePfError, UnknownService
-from tests.client_sdk.server_thread import server_thread
+from tests.kit.server_thread import server_thread
 
 LATE_S = 5.0
 """A call that has not ended this many seconds after its deadline hangs, also on a slow machine."""

@@ -10,9 +10,6 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from fake_burst import FakeBurst
-from fake_peers import peer, proxy_to
-from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
@@ -22,6 +19,9 @@ from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Failure
+from tests.kit.fake_burst_function import FakeBurst
+from tests.kit.fake_peers import peer, proxy_to
+from tests.kit.fake_platform import FakePlatform
 
 FAST = SessionSettings(stall_timeout_s=0.4)
 TIMINGS = ConnectTimings(reconnect_max_s=0.05, connect_timeout_s=0.5)

@@ -8,13 +8,13 @@ import ssl
 from pathlib import Path
 
 import pytest
-from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.network.dial_errors import untrusted_certificate_error
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.enrolment import Enrolment
 from rse_pf.errors import ConnectError, UsageError
+from tests.kit.fake_platform import FakePlatform
 
 KEY = json.loads(SigningKey.of_robot(b"r" * 32).to_json())
 

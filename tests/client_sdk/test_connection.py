@@ -8,8 +8,6 @@ import socket
 import time
 
 import pytest
-from fake_platform import FakePlatform
-from quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 import client_sdk
 from client_sdk.network.handshake import websocket_options
@@ -23,6 +21,8 @@ from rse_pf.errors import (
     UsageError,
 )
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER, MAX_BAD_MESSAGES
+from tests.kit.fake_platform import FakePlatform
+from tests.kit.quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 pytestmark = pytest.mark.system
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.network.bearer_token import strip_token
@@ -17,6 +16,7 @@ from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.errors import ConnectError, Unauthorized
 from rse_pf.pnp.problems import make_problem
+from tests.kit.fake_platform import FakePlatform
 
 TIMINGS = ConnectTimings(connect_timeout_s=0.5, reconnect_max_s=0.05)
 SECRET = "eyJhbGciOi.JFZERTQS.c2VjcmV0"

@@ -7,14 +7,14 @@ import hashlib
 
 import msgspec
 import pytest
-from fake_peers import after_request, http, peer, proxy_to, silent
-from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.network.http_proxy import find_proxy
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.errors import RsePfError, UsageError
+from tests.kit.fake_peers import after_request, http, peer, proxy_to, silent
+from tests.kit.fake_platform import FakePlatform
 
 VARIABLES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
 TIMINGS = ConnectTimings(connect_timeout_s=1.0, reconnect_max_s=0.01)

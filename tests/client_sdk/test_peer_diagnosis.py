@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass, replace
 
 import pytest
-from fake_peers import after_request, at_once, http, peer, silent, tls_context, with_tls
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
@@ -15,6 +14,7 @@ from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.auth.certificates import AUTHORITY_S, CertificateWithKey, make_authority
 from rse_pf.errors import ConnectError, RsePfError, UsageError
 from rse_pf.wire.refusal import refusal_body
+from tests.kit.fake_peers import after_request, at_once, http, peer, silent, tls_context, with_tls
 
 TIMINGS = ConnectTimings(connect_timeout_s=1.0, reconnect_max_s=0.01)
 OPTIONS = DataOptions(timeout_s=1.0, deadline_s=0.5, first_pause_s=0.01)

@@ -30,8 +30,8 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.maps.descriptors import ORB, DescriptorKind
 from rse_pf.maps.format import decode_map
-from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, frame_at, tracked
+from tests.kit.fake_live_map import solve
+from tests.kit.flat_world import STEP_M, frame_at, tracked
 
 IMAGE: npt.NDArray[np.uint8] = np.zeros((480, 640, 3), dtype=np.uint8)
 

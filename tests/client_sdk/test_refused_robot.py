@@ -8,13 +8,13 @@ import time
 from dataclasses import replace
 
 import pytest
-from fake_platform import FakePlatform
-from quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 import client_sdk
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Expired, Unauthorized
 from rse_pf.wire.server_session import CLOSE_REVOKED
+from tests.kit.fake_platform import FakePlatform
+from tests.kit.quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 pytestmark = pytest.mark.system
 

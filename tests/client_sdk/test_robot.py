@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import server_sessions
-from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
@@ -22,6 +20,8 @@ from rse_pf.errors import (
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services import pnp
 from rse_pf.wire import Command, Failure, Result
+from tests.kit import server_sessions
+from tests.kit.fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 FAST = SessionSettings(stall_timeout_s=0.4, ping_interval_s=0.2)
 

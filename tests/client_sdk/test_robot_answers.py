@@ -7,7 +7,6 @@ import dataclasses
 from random import Random
 
 import pytest
-from fake_platform import FakePlatform, echo_services
 
 import client_sdk
 from client_sdk.commands.traffic_stats import TrafficCounter
@@ -28,6 +27,7 @@ from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.echo import EchoReply
 from rse_pf.wire import Failure
+from tests.kit.fake_platform import FakePlatform, echo_services
 
 FAST = SessionSettings(stall_timeout_s=0.4)
 OWN_ECHO = client_sdk.CloudFirst(registry=echo_services(), robot_solve_s=0.01)

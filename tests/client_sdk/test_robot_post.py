@@ -7,7 +7,6 @@ import random
 from typing import Any
 
 import pytest
-from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
@@ -16,6 +15,7 @@ from rse_pf.errors import Disconnected
 from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import preencode
+from tests.kit.fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 FAST = SessionSettings(stall_timeout_s=0.4, ping_interval_s=0.2)
 

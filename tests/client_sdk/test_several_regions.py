@@ -10,14 +10,14 @@ from contextlib import AsyncExitStack
 from dataclasses import replace
 
 import pytest
-from fake_platform import FakePlatform, FakeSocket
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized, UsageError
 from rse_pf.wire.server_session import CLOSE_REPLACED
-from tests.client_sdk.delaying_proxy import DelayingProxy
+from tests.kit.delaying_proxy import DelayingProxy
+from tests.kit.fake_platform import FakePlatform, FakeSocket
 
 pytestmark = pytest.mark.system
 

@@ -7,7 +7,6 @@ import random
 from typing import Any
 
 import pytest
-from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.commands.subscriptions import Updates
@@ -15,6 +14,7 @@ from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, Forbidden
 from rse_pf.wire import CODECS
+from tests.kit.fake_platform import FakePlatform
 
 QUICK = SessionSettings(
     stall_timeout_s=0.3, ping_interval_s=0.1, ping_timeout_s=0.5,

@@ -9,14 +9,14 @@ import threading
 import time
 
 import pytest
-from fakes import FakeServer, answer_at_once, answer_nothing
-from quick_robots import QUICK, TIMINGS, robot
 
 import client_sdk
 from client_sdk.concurrency import user_callbacks
 from rse_pf.errors import ConnectError, Disconnected
 from rse_pf.wire import Progress
-from tests.client_sdk.server_thread import server_thread
+from tests.kit.fakes import FakeServer, answer_at_once, answer_nothing
+from tests.kit.quick_robots import QUICK, TIMINGS, robot
+from tests.kit.server_thread import server_thread
 
 
 def raise_error(*_):

@@ -21,13 +21,13 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, pose_difference
-from tests.chromium import chromium, film_as_camera
 from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.conftest import platform as platform
+from tests.kit.chromium import chromium, film_as_camera
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.examples.rendered_inputs import SCENE_CAMERA, TAG_M, draw_scene  # noqa: E402
 from tests.examples.test_object_recognition import COVER  # noqa: E402
+from tests.kit.rendered_inputs import SCENE_CAMERA, TAG_M, draw_scene  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(300)]
 

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from tests.chromium import chromium, film_as_camera
 from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.conftest import platform as platform
+from tests.kit.chromium import chromium, film_as_camera
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 from client_sdk.frontend import FrontEndOptions, extract  # noqa: E402

@@ -8,9 +8,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from tests.chromium import chromium
 from tests.examples.conftest import ExamplePlatform
 from tests.examples.conftest import platform as platform
+from tests.kit.chromium import chromium
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(300)]
 

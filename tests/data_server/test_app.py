@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_data_service import KEY, Service, small_settings
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -20,6 +19,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.data_server import http
 from rse_pf.errors import Archived, StoreError, StoreFull
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectInfo, digest_of
+from tests.kit.fake_data_service import KEY, Service, small_settings
 
 DATA = bytes(range(256)) * 4
 DIGEST = digest_of(DATA)

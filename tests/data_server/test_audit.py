@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fake_data_service import KEY, Service, small_settings
 
 from rse_pf.audit.entry import REFUSAL_BURST, Entry
 from rse_pf.audit.log import AuditLog, read_entries
@@ -16,6 +15,7 @@ from rse_pf.data_server.app import DataServer
 from rse_pf.data_server.server import _write_line
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_data_service import KEY, Service, small_settings
 
 MAPS = "/data/v1/maps/kitchen"
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from fake_data_service import Service, small_settings
 
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_data_service import Service, small_settings
 
 PAGE = "https://robots.example.org"
 DATA = b"a keyframe"

@@ -8,10 +8,10 @@ import os
 from pathlib import Path
 
 import pytest
-from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.errors import Busy, Conflict, NotFound
 from rse_pf.storage.object_store import DirectoryStore, digest_of
+from tests.kit.fake_data_service import Answer, Service, small_settings
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)

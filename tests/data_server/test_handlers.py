@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 
-from fake_data_service import Answer, Service, small_settings
-
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_data_service import Answer, Service, small_settings
 
 MAPS = "/data/v1/maps/kitchen"
 

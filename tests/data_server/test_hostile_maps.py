@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fake_data_service import Service, small_settings
-from hostile.hostile_maps import DECODABLE, hostile_maps
 
 from rse_pf.data_server.map_describer import TARGET, MapDescriber
 from rse_pf.data_server.robot_processes import RobotProcesses
@@ -16,6 +14,8 @@ from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import DirectoryStore, digest_of
+from tests.kit.fake_data_service import Service, small_settings
+from tests.kit.hostile_maps import DECODABLE, hostile_maps
 
 MIB = 1 << 20
 COSTLY = ("ten million empty lists", "one keyframe of 500,000 features", "300 keyframes")

@@ -14,9 +14,6 @@ import numpy as np
 import pytest
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from fake_data_service import Answer, Service, small_settings  # noqa: E402
-from hostile.hostile_images import HARMLESS, hostile_images, photo  # noqa: E402
-
 from client_sdk.frontend import Frame, FrontEndOptions, extract  # noqa: E402
 from client_sdk.simulator import make_world, render_along, true_trajectory  # noqa: E402
 from rse_pf.data_server.photo_localiser import make_handler  # noqa: E402
@@ -25,6 +22,8 @@ from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map  # n
 from rse_pf.maps.registry import MapRegistry  # noqa: E402
 from rse_pf.services.mapping.photo import outline_of  # noqa: E402
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore  # noqa: E402
+from tests.kit.fake_data_service import Answer, Service, small_settings  # noqa: E402
+from tests.kit.hostile_images import HARMLESS, hostile_images, photo  # noqa: E402
 
 pytestmark = pytest.mark.timeout(120)
 

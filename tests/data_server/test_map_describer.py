@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_data_service import small_settings
 
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.map_describer import TARGET, MapDescriber
@@ -18,6 +17,7 @@ from rse_pf.limits.crash_record import BLOCK_S
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore
+from tests.kit.fake_data_service import small_settings
 
 ROBOT, OTHER = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 EMPTY = MapSummary(keyframes=0, edges=0, points=0, robots=())

@@ -6,10 +6,10 @@ import json
 from collections.abc import Callable
 
 import pytest
-from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_data_service import Answer, Service, small_settings
 
 OWNER, RIVAL = "acme", "rival"
 MAPS = "/data/v1/maps/kitchen"

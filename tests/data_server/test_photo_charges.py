@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from fake_data_service import Service, small_settings
 
 from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
 from rse_pf.maps.photos import PhotoLens, PhotoLocation
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_data_service import Service, small_settings
 
 ROBOT = RobotId("acme", "robot-1")
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 
 import pytest
-from fake_data_service import Service, small_settings
 
 from rse_pf.data_server.handlers import PRESIGNED_URL_TTL_S
 from rse_pf.identity import RobotId, object_name
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_data_service import Service, small_settings
 
 DATA = bytes(range(256)) * 40
 DIGEST = digest_of(DATA)

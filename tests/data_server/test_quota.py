@@ -8,7 +8,6 @@ import urllib.parse
 from pathlib import Path
 
 import pytest
-from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.config import DataSettings
 from rse_pf.errors import QuotaExceeded, StoreFull
@@ -16,6 +15,7 @@ from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
 from rse_pf.storage.quotas import Accounts
+from tests.kit.fake_data_service import Answer, Service, small_settings
 
 ROBOT = RobotId("default", "robot-1")
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from fake_data_service import Service
 
 from rse_pf.data_server.handlers import Handlers
 from rse_pf.data_server.routes import ROUTES, Route, openapi, openapi_page
+from tests.kit.fake_data_service import Service
 
 
 def test_the_service_returns_the_same_document_without_a_token(service: Service) -> None:

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from fake_data_service import KEY, Service, small_settings
 
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.auth.tokens import SigningKey
@@ -15,6 +14,7 @@ from rse_pf.auth.trust_store import REFRESH_S, AccessControlStore
 from rse_pf.data_server import DataServer
 from rse_pf.data_server.server import KeysFile
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, digest_of
+from tests.kit.fake_data_service import KEY, Service, small_settings
 
 ROBOT = SigningKey.of_robot(b"r" * 32)
 

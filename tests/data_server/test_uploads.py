@@ -7,10 +7,10 @@ import os
 from pathlib import Path
 
 import pytest
-from fake_data_service import Answer, Service, small_settings
 
 from rse_pf.data_server.uploads import UPLOAD_TTL_S
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, digest_of
+from tests.kit.fake_data_service import Answer, Service, small_settings
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)

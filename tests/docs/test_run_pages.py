@@ -24,10 +24,11 @@ from queue import Empty, Queue
 from unittest import SkipTest
 
 import pytest
-from documentation_pages import PAGES, ROOT
 from sybil import Document, Example, Region, Sybil
 from sybil.parsers.markdown import SkipParser
 from sybil.parsers.markdown.lexers import DirectiveInHTMLCommentLexer, FencedCodeBlockLexer
+
+from tests.kit.documentation_pages import PAGES, ROOT
 
 pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -26,8 +26,8 @@ from rse_pf.enrolment import Enrolment
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.services.custom.installed import install
 from rse_pf.storage.object_store import DirectoryStore
-from tests.client_sdk.delaying_proxy import DelayingProxy
-from tests.examples.example_page import PAGE, REPOSITORY, listed
+from tests.kit.delaying_proxy import DelayingProxy
+from tests.kit.example_page import PAGE, REPOSITORY, listed
 
 T = TypeVar("T")
 ROBOTS = ("robot-1", "robot-2", "robot-4")

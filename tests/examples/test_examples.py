@@ -18,13 +18,13 @@ import pytest
 
 from client_sdk.point_map import read_ply
 from client_sdk.trajectory import read_trajectory
-from tests.client_sdk.delaying_proxy import DelayingProxy
 from tests.examples.conftest import ExamplePlatform, Program
-from tests.examples.example_page import REPOSITORY
+from tests.kit.delaying_proxy import DelayingProxy
+from tests.kit.example_page import REPOSITORY
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.examples.rendered_inputs import SCENE_CAMERA, draw_scene, write_video  # noqa: E402  after importorskip
 from tests.examples.test_object_recognition import COVER, placed  # noqa: E402  after importorskip
+from tests.kit.rendered_inputs import SCENE_CAMERA, draw_scene, write_video  # noqa: E402  after importorskip
 
 pytestmark = pytest.mark.system
 Start = Callable[[list[str]], Program]

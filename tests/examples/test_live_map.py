@@ -17,7 +17,7 @@ from rse_pf.maps.format import decode_map
 from tests.examples.conftest import ExamplePlatform
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.examples.rendered_inputs import write_drives
+from tests.kit.rendered_inputs import write_drives
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 HAS_DATA = True

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from client_sdk.live import LiveMapper, LiveOptions
-from tests.client_sdk.live.fake_live_map import FakeLiveRobot, solve
-from tests.client_sdk.mapper.flat_world import CAMERA, frame_at
-from tests.examples.example_page import REPOSITORY
+from tests.kit.example_page import REPOSITORY
+from tests.kit.fake_live_map import FakeLiveRobot, solve
+from tests.kit.flat_world import CAMERA, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

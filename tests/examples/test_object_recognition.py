@@ -16,7 +16,7 @@ from rse_pf.services.custom.installed import read_service
 from rse_pf.services.custom.runtime import Runtime, open_runtime
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.examples.rendered_inputs import SCENE_CAMERA, TAG_M, draw_scene  # noqa: E402  after importorskip
+from tests.kit.rendered_inputs import SCENE_CAMERA, TAG_M, draw_scene  # noqa: E402  after importorskip
 
 FOLDER = Path(__file__).parents[2] / "examples" / "robots" / "object_recognition_service"
 COVER = FOLDER / "objects" / "cover.png"

@@ -11,7 +11,7 @@ from tests.examples.conftest import ExamplePlatform
 
 for _package in ("cv2", "gtsam"):
     pytest.importorskip(_package, reason="pip install 'rse-pf[vision,maps]'")
-from tests.examples.rendered_inputs import write_drives  # noqa: E402  after importorskip
+from tests.kit.rendered_inputs import write_drives  # noqa: E402  after importorskip
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 HAS_DATA = True

@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.chromium import chromium
+from tests.kit.chromium import chromium
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

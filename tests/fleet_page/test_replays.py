@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recording.replay.made import Made
-
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.fleet_page.replays import replay_document
 from rse_pf.extensions.recording.replay import run
 from rse_pf.pnp.problems import make_problem
+from tests.kit.recorded_sessions import Made
 
 
 def test_a_weak_pose_shows_its_matches_and_the_rules_that_it_broke(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ import socket
 from collections.abc import Iterator
 
 import pytest
-from data_process import DataProcess
+
+from tests.kit.data_process import DataProcess
 
 pytestmark = pytest.mark.system
 

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
 
 from client_sdk import connect
 from rse_pf.wire import Command, Result
-from tests.hostile import attacks
-from tests.hostile.attacks import AttackTarget, Outcome
+from tests.kit import attacks
+from tests.kit.attacks import AttackTarget, Outcome
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = pytest.mark.system
 

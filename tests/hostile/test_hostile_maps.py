@@ -7,10 +7,10 @@ import time
 import tracemalloc
 
 import pytest
-from hostile.hostile_maps import DAMAGED_PROVENANCE, DECODABLE, hostile_maps
 
 from rse_pf.errors import BadRequest, RsePfError
 from rse_pf.maps.format import MapVersion, decode_map
+from tests.kit.hostile_maps import DAMAGED_PROVENANCE, DECODABLE, hostile_maps
 
 _MAX_MS, _MAX_MIB = 100.0, 64.0
 _SLOW_MACHINE = 6.0

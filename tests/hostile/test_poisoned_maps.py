@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile.hostile_maps import hostile_maps
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError
@@ -26,7 +25,8 @@ from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Command, Failure, Result
-from tests.synthetic_maps import make_sphere, make_world
+from tests.kit.hostile_maps import hostile_maps
+from tests.kit.synthetic_maps import make_sphere, make_world
 
 REGISTRY = builtin_services(PlatformSettings())
 INFORMATION = np.diag([100.0, 100, 100, 400, 400, 400])

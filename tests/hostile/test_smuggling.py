@@ -16,14 +16,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from data_process import DataProcess
-from guarded_server import GuardedServer
-from hostile.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
 from rse_pf.config import PlatformSettings
 from rse_pf.local.balancer.envoy_config import DATA_CLUSTER, Target
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.server.gateway.rate_limits import SourceRates
+from tests.kit.data_process import DataProcess
+from tests.kit.guarded_server import GuardedServer
+from tests.kit.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
 pytestmark = pytest.mark.system
 

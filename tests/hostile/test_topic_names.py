@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
 from rosbridge.conftest import opened
 
 from rse_pf.errors import BadRequest
 from rse_pf.wire.live_map import map_of_topic
+from tests.kit.guarded_server import GuardedServer
 
 NAMES = {
     "nothing": "",

@@ -16,7 +16,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from recording.replay.made import Made, jpeg
 
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
@@ -24,6 +23,7 @@ from rse_pf.errors import RsePfError
 from rse_pf.extensions.recording import file_format
 from rse_pf.extensions.recording.replay.limited import LimitedReplay
 from rse_pf.pnp.problems import make_problem
+from tests.kit.recorded_sessions import Made, jpeg
 
 pytest.importorskip("mcap", reason="pip install 'rse-pf[local]'")
 

@@ -8,11 +8,11 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from hostile.smuggling_samples import SAMPLES
-from http_service import http_service
 
 from fuzz.http_twin import compare, disagreement
 from rse_pf.http.connections import MAX_HEAD_BYTES, MAX_HEADERS
+from tests.kit.http_service import http_service
+from tests.kit.smuggling_samples import SAMPLES
 
 SOON_S = 30.0
 GET = b"GET /a HTTP/1.1\r\nHost: x\r\n\r\n"

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fakes import FakeLoop
-from http_service import http_service
 
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 from rse_pf.http.control_port import ControlReply, serve_control
@@ -26,6 +24,8 @@ from rse_pf.http.unauthenticated import (
 from rse_pf.local.control.control_port import serve_control_port
 from rse_pf.server.live_map.connection_security import client_context, server_context
 from rse_pf.server.live_map.map_server.worker_connections import listen
+from tests.kit.fakes import FakeLoop
+from tests.kit.http_service import http_service
 
 COUNT, SECONDS, DEADLINE_S = 300, 1.0, 10.0
 TOKEN = "t" * 32

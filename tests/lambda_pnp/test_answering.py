@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hostile.hostile_maps import hostile_maps
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -20,6 +19,7 @@ from lambda_pnp.keys import KeyCache
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, make_codec
+from tests.kit.hostile_maps import hostile_maps
 
 SETTINGS = PlatformSettings()
 KEY = SigningKey.from_seed(bytes(range(32)), "key-1")

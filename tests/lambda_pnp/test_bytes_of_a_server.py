@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 import websockets
-from guarded_server import KEY, GuardedServer
 
 from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
 from rse_pf.pnp.problems import KINECT, make_degenerate, make_problem
 from rse_pf.services.pnp import PnpRequest, make_request
 from rse_pf.wire import CODECS, SUBPROTOCOLS, Command, Failure, Hello, Result, make_codec
+from tests.kit.guarded_server import KEY, GuardedServer
 
 pytestmark = pytest.mark.system
 PNP = '{"type":"command","id":7,"service":"pnp","payload":%s}'

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_platform import FakePlatform
-from http_service import http_service
 
 import client_sdk
 from lambda_pnp.local_front import LocalFront, answering_of, main
@@ -21,6 +19,8 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import BURST_PATH
 from rse_pf.pnp.problems import make_problem
+from tests.kit.fake_platform import FakePlatform
+from tests.kit.http_service import http_service
 
 KEY = SigningKey.from_seed(bytes(range(32)), "key-1")
 SETTINGS = PlatformSettings()

@@ -85,7 +85,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/aws/canary/test_handler.py", "Secret Keyword"): "made for moto",
     ("tests/aws/canary/test_handler.py", "Hex High Entropy String"): "the example of W3C's Trace Context",
     ("rse_pf/aws/lifecycle/proof.py", "Secret Keyword"): "the name of a service",
-    ("tests/emulated_aws.py", "Secret Keyword"): "made for emulators",
+    ("tests/kit/emulated_aws.py", "Secret Keyword"): "made for emulators",
     ("tests/client_sdk/test_burst_policy.py", "Basic Auth Credentials"): "made up, to be left out",
     ("tests/stacks/test_first_boot.py", "Secret Keyword"): "made for moto",
     ("tests/system/boot/imds.py", "Secret Keyword"): "made for moto",

@@ -13,7 +13,7 @@ from rse_pf.live_map.live_map import LiveMap
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.inertial import KeyframeImu
 from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe
-from tests.live_map.generated_drives import GeneratedWorld, circle
+from tests.kit.generated_drives import GeneratedWorld, circle
 
 DOWN = np.array([0.3, 0.9, -0.2]) / np.linalg.norm([0.3, 0.9, -0.2])
 """Direction of gravity in the true world, a unit vector."""

@@ -13,8 +13,8 @@ from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Culled
 from rse_pf.live_map.outlier_rejection import find_weakest_connection, has_odometry_jump
 from rse_pf.slam.keyframe import decode_keyframe
-from tests.live_map.generated_drives import first_view
-from tests.live_map.hostile_rig import (
+from tests.kit.generated_drives import first_view
+from tests.kit.hostile_rig import (
     ACCEPTED,
     HOSTILE,
     REFUSED,

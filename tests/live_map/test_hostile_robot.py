@@ -16,8 +16,8 @@ from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureRejected, Unaligned
 from rse_pf.live_map.smoothing import smooth_changes
-from tests.live_map.generated_drives import GeneratedWorld, circle, first_view
-from tests.live_map.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
+from tests.kit.generated_drives import GeneratedWorld, circle, first_view
+from tests.kit.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 
 JOINED = {"a": True, "b": True, "c": True}
 

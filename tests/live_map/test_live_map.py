@@ -38,7 +38,7 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.live_map.versions import started_from
 from rse_pf.slam.keyframe import encode_keyframe
-from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
+from tests.kit.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
 
 ROUND = circle(0.5, 1.2)
 

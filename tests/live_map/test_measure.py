@@ -12,7 +12,7 @@ from rse_pf.pnp import DepthNoise
 from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.keyframe import KeyframeFeatures, SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.relative_pose import RelativePoseOptions
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 WORLD, TRUTH = make_world(3, points=4000).walk("r", np.array([0.0, 0.02, 0.04, 0.5]), seed=1)
 CAMERA = WORLD.keyframes[0].camera

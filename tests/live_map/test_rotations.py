@@ -19,7 +19,7 @@ from rse_pf.slam.keyframe import encode_keyframe
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.wire.live_map import KeyframeRequest
-from tests.live_map.generated_drives import INFORMATION, GeneratedWorld, make_link, straight
+from tests.kit.generated_drives import INFORMATION, GeneratedWorld, make_link, straight
 
 FITTING = np.sqrt(1.0 + 1.9e-3)
 """A rotation that is scaled by this is accepted, and the step between two of them was refused."""

@@ -30,9 +30,9 @@ from rse_pf.live_map.pairwise_consistency import relative_pose_between_component
 from rse_pf.slam.consistency import EdgeArrays, OdometryNoise, are_pairwise_consistent
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
 from rse_pf.slam.smoother import ScaleTerms, smooth
-from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
-from tests.live_map.hostile_robot import play, without
-from tests.synthetic_maps import make_world
+from tests.kit.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
+from tests.kit.hostile_robot import play, without
+from tests.kit.synthetic_maps import make_world
 
 HOSTILE = "x"
 WAY = 1.0, 1.1

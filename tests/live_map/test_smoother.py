@@ -13,7 +13,7 @@ from rse_pf.live_map.smoothing import smooth_around
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.slam.smoother import SmoothedPoses, smooth
-from tests.live_map.generated_drives import GeneratedWorld, circle, make_link
+from tests.kit.generated_drives import GeneratedWorld, circle, make_link
 
 FREE = 12
 

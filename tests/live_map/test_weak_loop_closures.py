@@ -11,7 +11,7 @@ from rse_pf.live_map.events import LoopClosuresMeasured, MeasuredLoopClosure
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.smoothing import select_edges
 from rse_pf.slam.consistency import evidence_weight
-from tests.live_map.generated_drives import GeneratedWorld, circle, make_link
+from tests.kit.generated_drives import GeneratedWorld, circle, make_link
 
 WEAK_INLIERS = 20
 """Inliers of a loop closure with a weight of two thirds."""

@@ -15,8 +15,8 @@ from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Outcome, Unaligned
 from rse_pf.live_map.outlier_rejection import decide_exclusion, has_wrong_scale
 from rse_pf.slam.keyframe import decode_keyframe, make_features
-from tests.live_map.generated_drives import GeneratedWorld, circle, first_view
-from tests.live_map.hostile_rig import generated_drives
+from tests.kit.generated_drives import GeneratedWorld, circle, first_view
+from tests.kit.hostile_rig import generated_drives
 
 
 def graph_of(*robots: str) -> MapGraph:

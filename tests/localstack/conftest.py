@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import REGION, is_localstack, load_services, localstack_url
 
 from rse_pf.config import PlatformSettings
+from tests.kit.emulated_aws import REGION, is_localstack, load_services, localstack_url
 
 ACCOUNT = "000000000000"
 DEPLOYED = ("Network", "Data", "Backend")

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine
-from emulated_aws import REGION
 from localstack.conftest import SETTINGS, Deployment
 
 from rse_pf.aws.clients import make_client
@@ -23,6 +21,8 @@ from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.aws.fleet.tasks import server_metrics, store_errors
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.emulated_aws import REGION
+from tests.kit.fake_machine import FakeMachine
 
 NOT_EVALUATED = {
     "balancer-errors",

@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from emulated_aws import REGION
 from localstack.conftest import DEPLOYED, Deployment
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
+from tests.kit.emulated_aws import REGION
 
 NOT_MADE = {
     "AWS::AutoScaling::AutoScalingGroup",

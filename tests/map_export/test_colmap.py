@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_export.exact_maps import OTHER_CAMERA, points_map, world_map
 
 from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.colmap import encode_colmap
 from rse_pf.extensions.map_export.tracks import find_tracks
 from rse_pf.geometry import from_quaternion, inverse
 from rse_pf.maps.format import Edge, MapVersion
+from tests.kit.exact_maps import OTHER_CAMERA, points_map, world_map
 
 NO_PYCOLMAP = "pycolmap is not installed, and in no lock: its wheel has 38 MB (pip install pycolmap==4.2.1)"
 

@@ -10,14 +10,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hostile.hostile_maps import DECODABLE, hostile_maps
-from map_export.exact_maps import points_map
 
 from rse_pf.cli.main import main
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
 from rse_pf.storage.object_store import DirectoryStore, digest_of
+from tests.kit.exact_maps import points_map
+from tests.kit.hostile_maps import DECODABLE, hostile_maps
 
 FORMATS = ("colmap", "nerfstudio", "occupancy", "ply", "pcd", "tum", "g2o")
 WRITTEN = {

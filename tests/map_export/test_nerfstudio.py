@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 import pytest
-from map_export.exact_maps import OTHER_CAMERA, points_map
 
 from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.nerfstudio import encode_nerfstudio
 from rse_pf.geometry import inverse, transform
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.ply import decode_ply
+from tests.kit.exact_maps import OTHER_CAMERA, points_map
 
 Row = Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]

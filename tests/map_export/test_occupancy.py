@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from map_export.exact_maps import CAMERA, shares_right, world_map
 
 from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.occupancy import (
@@ -21,6 +20,7 @@ from rse_pf.extensions.map_export.occupancy import (
 from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.level_surfaces import floor_normal, level_surface_normal
+from tests.kit.exact_maps import CAMERA, shares_right, world_map
 
 UP = GridOptions(up=(0.0, 0.0, 1.0))
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from maps.sample_maps import make_map
 
 from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.single_files import encode_single_file
 from rse_pf.geometry import transform
 from rse_pf.slam.ply import decode_ply
 from rse_pf.slam.pose_graph import read_g2o
+from tests.kit.sample_maps import make_map
 
 
 def test_the_g2o_file_holds_the_pose_graph_of_the_map() -> None:

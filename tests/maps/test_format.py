@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from maps.sample_maps import make_map
 
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import MapLimits, decode_map, encode_map
+from tests.kit.sample_maps import make_map
 
 
 def test_a_decoded_map_equals_the_encoded_one() -> None:

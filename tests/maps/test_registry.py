@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from maps.sample_maps import make_map
 
 from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry, compare_versions
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore
+from tests.kit.sample_maps import make_map
 
 
 def commit(maps: MapRegistry, seed: int, parent: str | None) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from maps.sample_maps import make_map
 
 from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull
 from rse_pf.identity import RobotId
@@ -20,6 +19,7 @@ from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import ABANDONED_S, MAX_REMOVAL_S, Marks, choose_superseded, count_freed_bytes
 from rse_pf.storage.charges import charge_name, sum_charges
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage
+from tests.kit.sample_maps import make_map
 
 NAME, FOLDER = "kitchen", "maps/default/kitchen/"
 ROBOT = RobotId("default", "robot-1")

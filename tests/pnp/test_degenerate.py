@@ -14,7 +14,7 @@ from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError,
 from rse_pf.geometry import transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
-from tests.pnp.native_reference import EVERY
+from tests.kit.native_reference import EVERY
 
 
 def outcome(points, pixels, engine="native", **options):

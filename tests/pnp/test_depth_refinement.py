@@ -17,7 +17,7 @@ from rse_pf.pnp import (
     solve_pnp,
 )
 from rse_pf.pnp.problems import KINECT
-from tests.two_views import TwoViews, make_two_views
+from tests.kit.two_views import TwoViews, make_two_views
 
 _NOISE = DepthNoise()
 _options = PnpOptions(inlier_px=5.0)

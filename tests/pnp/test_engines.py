@@ -12,7 +12,7 @@ from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import pose_difference
 from rse_pf.pnp import PnpOptions, available_engines, engines, solve_pnp
 from rse_pf.pnp.problems import make_problem
-from tests.pnp.native_reference import EVERY
+from tests.kit.native_reference import EVERY
 
 
 def right(solution, problem):

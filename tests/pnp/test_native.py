@@ -26,8 +26,7 @@ from rse_pf.errors import (
 from rse_pf.pnp import PnpOptions, WeakLimits, engines
 from rse_pf.pnp.native_solver import NativeSolver, native_solver, open_solver
 from rse_pf.pnp.problems import KINECT, make_problem
-from tests.oracles import pose_evidence
-from tests.pnp.native_reference import (
+from tests.kit.native_reference import (
     accepted,
     case,
     compare,
@@ -36,6 +35,7 @@ from tests.pnp.native_reference import (
     outcome,
     same_bytes,
 )
+from tests.oracles import pose_evidence
 
 COMPILER = os.environ.get("CXX", "g++")
 OPTIONS = engines.native_options(PnpOptions(), WeakLimits())

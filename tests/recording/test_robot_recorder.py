@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import FakeServer
 from mcap.reader import make_reader
 from PIL import Image
 
@@ -24,6 +23,7 @@ from rse_pf.extensions.recording.robot_recorder import RobotRecorder
 from rse_pf.geometry import Camera
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services import pnp
+from tests.kit.fakes import FakeServer
 
 TOKEN = "eyJhbGciOiJFZERTQSJ9." + base64.urlsafe_b64encode(b'{"tenant":"acme"}').decode() + ".c2lnbmVkYnl1cw"
 PROBLEM = make_problem(seed=3)

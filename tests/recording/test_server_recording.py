@@ -15,7 +15,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from guarded_server import KEY, GuardedServer
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
@@ -25,6 +24,7 @@ from rse_pf.errors import RsePfError
 from rse_pf.extensions.recording.reader import open_recording
 from rse_pf.pnp.problems import make_problem
 from rse_pf.wire import CODECS
+from tests.kit.guarded_server import KEY, GuardedServer
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

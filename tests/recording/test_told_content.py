@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from server.gateway.worker_parts import worker_parts
 
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.extensions.recording.recorder_process import MessageRecorder
@@ -31,6 +30,7 @@ from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry
 from rse_pf.services import pnp
 from rse_pf.wire import CODECS, Command, Ping, make_codec
+from tests.kit.worker_parts import worker_parts
 
 ROBOT = RobotId("default", "robot-seven")
 TOKEN = "eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyIn0.c2lnbmF0dXJl"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ros_bridge.ros2 import ROS2, Ros2
+from tests.kit.ros2 import ROS2, Ros2
 
 
 @pytest.fixture

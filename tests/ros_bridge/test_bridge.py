@@ -23,9 +23,9 @@ from ros_bridge import Bridge, BridgeOptions
 from ros_bridge.bridge import connected_bridge
 from ros_bridge.outgoing import Message
 from rse_pf.errors import ConnectError, Unauthorized, UsageError
-from tests.client_sdk.bags.small_bags import raw_image
-from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import frame_at
+from tests.kit.fake_live_map import solve
+from tests.kit.flat_world import frame_at
+from tests.kit.small_bags import raw_image
 
 START_NS = 1_700_000_000_000_000_000
 MAKER = MessageMaker(is_ros1=True)

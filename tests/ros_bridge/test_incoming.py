@@ -11,7 +11,7 @@ from client_sdk.frontend import Frame
 from ros_bridge import BridgeOptions, IncomingFrames
 from ros_bridge.incoming import Role
 from ros_bridge.input_check import InputCheck
-from tests.client_sdk.bags.small_bags import camera_info, raw_image, scene, stamp_of
+from tests.kit.small_bags import camera_info, raw_image, scene, stamp_of
 
 SHOWN = scene()
 MS = 1_000_000

@@ -20,7 +20,7 @@ from ros_bridge.incoming import Role
 from ros_bridge.shell import taken
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_se3
-from tests.client_sdk.bags.small_bags import (
+from tests.kit.small_bags import (
     CX,
     CY,
     FX,

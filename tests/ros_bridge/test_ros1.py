@@ -16,8 +16,8 @@ import pytest
 from client_sdk.bags.message_types import load_types
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
-from tests.client_sdk.bags.recorded_bags import write_recording
-from tests.ros_bridge.programs import Line, Program, RosPrograms, own_run, poses, tell_delay, worst_mm
+from tests.kit.recorded_bags import write_recording
+from tests.kit.ros_programs import Line, Program, RosPrograms, own_run, poses, tell_delay, worst_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -13,9 +13,9 @@ import pytest
 from client_sdk.trajectory import read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
-from tests.client_sdk.bags.recorded_bags import write_recording
-from tests.ros_bridge.programs import own_run, poses, tell_delay, worst_mm
-from tests.ros_bridge.ros2 import COLOUR, Ros2, all_is_played
+from tests.kit.recorded_bags import write_recording
+from tests.kit.ros2 import COLOUR, Ros2, all_is_played
+from tests.kit.ros_programs import own_run, poses, tell_delay, worst_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

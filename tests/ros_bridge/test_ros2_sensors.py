@@ -13,9 +13,9 @@ from client_sdk.rigs.rig_file import read_rig
 from ros_bridge import BridgeOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
-from tests.ros_bridge.programs import own_run, poses, worst_mm
-from tests.ros_bridge.rendered_bags import ENCODINGS, STEREO, write_encodings, write_stereo
-from tests.ros_bridge.ros2 import Ros2, all_is_played
+from tests.kit.rendered_bags import ENCODINGS, STEREO, write_encodings, write_stereo
+from tests.kit.ros2 import Ros2, all_is_played
+from tests.kit.ros_programs import own_run, poses, worst_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
-from rosbridge.clients import Bridge
 
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.rosbridge.server import open_rosbridge
+from tests.kit.guarded_server import GuardedServer
+from tests.kit.rosbridge_clients import Bridge
 
 UNLIMITED = {"max_commands_per_s": 0.0}
 

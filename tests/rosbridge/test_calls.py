@@ -7,10 +7,11 @@ import json
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
-from rosbridge.clients import auth, call
 from rosbridge.conftest import opened
 from websockets.exceptions import InvalidStatus
+
+from tests.kit.guarded_server import GuardedServer
+from tests.kit.rosbridge_clients import auth, call
 
 
 async def test_a_call_reaches_the_service_and_the_answer_has_its_id_and_spelling(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from guarded_server import GuardedServer
-from rosbridge.clients import publish, subscribe
 from rosbridge.conftest import opened
+
+from tests.kit.guarded_server import GuardedServer
+from tests.kit.rosbridge_clients import publish, subscribe
 
 SCAN = """{"op":"publish","topic":"/scan","type":"sensor_msgs/LaserScan",
     "msg":{"range_max":30.0,"ranges":[1.0,NaN,Infinity,-Infinity,2.5]}}"""

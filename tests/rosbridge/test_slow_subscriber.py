@@ -7,9 +7,10 @@ import socket
 from urllib.parse import urlsplit
 
 import pytest
-from guarded_server import GuardedServer
-from rosbridge.clients import Client, publish, subscribe
 from rosbridge.conftest import opened
+
+from tests.kit.guarded_server import GuardedServer
+from tests.kit.rosbridge_clients import Client, publish, subscribe
 
 pytestmark = pytest.mark.slow
 SECONDS = 15.0

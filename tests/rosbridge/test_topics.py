@@ -7,13 +7,13 @@ import gc
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
-from rosbridge.clients import Client, call, publish, subscribe
 from rosbridge.conftest import opened
 
 from rse_pf.extensions.rosbridge import topics as limits
 from rse_pf.extensions.rosbridge.client import Client as RosbridgeClient
 from rse_pf.extensions.rosbridge.subscription import Subscription, TopicMessage
+from tests.kit.guarded_server import GuardedServer
+from tests.kit.rosbridge_clients import Client, call, publish, subscribe
 
 HOUR_MS = 3_600_000
 

@@ -9,7 +9,7 @@ import pytest
 from rse_pf.config import ScalingSettings
 from rse_pf.errors import UsageError
 from rse_pf.scaling.alarms import Alarm, alarms_of
-from tests.alarm_states import AlarmRule, State, Value, next_state, replay, statistic, value_of
+from tests.kit.alarm_states import AlarmRule, State, Value, next_state, replay, statistic, value_of
 
 RULE = AlarmRule(
     expression="m", comparison="GreaterThanOrEqualToThreshold", threshold=1.0, periods=3, datapoints=3,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from scaling.fleet_traffic import Robot, measure_traffic
 
 from rse_pf.auth.roster import SYNTHETIC, check_scopes, scopes_allow
 from rse_pf.config import ScalingSettings
 from rse_pf.errors import UsageError
 from rse_pf.scaling.alarms import alarms_of
+from tests.kit.fleet_traffic import Robot, measure_traffic
 from tests.scaling.test_one_policy import Cloud, Local
 
 SCALING = ScalingSettings()

@@ -6,7 +6,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from server.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
@@ -17,6 +16,7 @@ from rse_pf.server.scheduling.scheduler import INLINE_BYTES
 from rse_pf.service import Registry
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command
+from tests.kit.worker_parts import WorkerParts, worker_parts
 
 SETTINGS = PlatformSettings.from_dict({"session": {"max_message_bytes": 65536}})
 

@@ -48,7 +48,7 @@ from rse_pf.slam.tracking import (
     match_predictions,
 )
 from rse_pf.wire import Command, Failure, Result
-from tests.live_map.generated_drives import GeneratedWorld, circle
+from tests.kit.generated_drives import GeneratedWorld, circle
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 SIFT, XFEAT, AKAZE = (

@@ -15,7 +15,7 @@ from rse_pf.services.mapping.photo import location_of
 from rse_pf.services.mapping.place import MapIndex
 from rse_pf.slam.guided_search import GuidedPose, MapLandmarks, search_around
 from rse_pf.slam.relative_pose import View, landmarks_of_keyframe
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 WORLD = make_world(1)
 TRUTH = WORLD.pose(0.31)

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from default_cases import first_by_default
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, pose_difference
 from rse_pf.slam.icp import IcpOptions, align_clouds
-from tests.synthetic_maps import make_room as full_room
+from tests.kit.default_cases import first_by_default
+from tests.kit.synthetic_maps import make_room as full_room
 
 pytest.importorskip("small_gicp", reason="the extra maps is not installed")
 

@@ -18,7 +18,7 @@ from rse_pf.slam.localise import (
     spread_candidates,
 )
 from rse_pf.slam.relative_pose import RelativePoseOptions
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 
 def coded(keyframe) -> KeyframeFeatures:

@@ -6,7 +6,6 @@ import functools
 
 import numpy as np
 import pytest
-from default_cases import first_by_default
 
 from rse_pf.errors import Cancelled, MissingExtra
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
@@ -24,7 +23,8 @@ from rse_pf.slam.map_merge import (
     propose_loop_closures,
 )
 from rse_pf.slam.optimise import ignore_progress
-from tests.synthetic_maps import make_world
+from tests.kit.default_cases import first_by_default
+from tests.kit.synthetic_maps import make_world
 
 pytest.importorskip("gtsam", reason="the extra maps is not installed")
 

@@ -11,7 +11,7 @@ from rse_pf.errors import BadRequest, Cancelled
 from rse_pf.geometry import Array, exp_se3, inverse, log_se3
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.pose_graph import PoseGraph, connected_components, read_g2o, write_g2o
-from tests.synthetic_maps import make_sphere
+from tests.kit.synthetic_maps import make_sphere
 
 pytest.importorskip("gtsam", reason="the extra maps is not installed")
 

@@ -16,7 +16,7 @@ from rse_pf.services.mapping.place import MapIndex, PlaceReply, PlaceRequest, Wi
 from rse_pf.slam.descriptors import best_matches
 from rse_pf.slam.relative_pose import View
 from rse_pf.wire import Command, Failure, Result
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 WORLD = make_world(1)
 TURNS = np.linspace(0.0, 1.0, 24, endpoint=False)

@@ -9,7 +9,7 @@ import pytest
 
 from rse_pf.errors import BadRequest
 from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, VOCABULARY_FILE, PlaceIndex, place_vector
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 
 def unit_vectors(n: int, seed: int = 1):

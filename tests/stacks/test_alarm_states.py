@@ -1,6 +1,6 @@
 """Every alarm of the templates, on replayed metrics: quiet while all is well, ALARM on its fault, then OK.
 
-The alarms are parsed from the templates, and evaluated by `tests.alarm_states`.  A sample is what a
+The alarms are parsed from the templates, and evaluated by `tests.kit.alarm_states`.  A sample is what a
 service of AWS or an agent publishes in one period; the statistic is made of the samples of a period.
 """
 
@@ -10,14 +10,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pytest
-from scaling.fleet_traffic import Robot, measure_traffic
 
 from rse_pf.auth.roster import SYNTHETIC
 from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import CPU
 from rse_pf.scaling.operator_alarms import operator_alarms
 from rse_pf.scaling.profile import cadence_of
-from tests.alarm_states import AlarmRule, State, Value, replay, statistic
+from tests.kit.alarm_states import AlarmRule, State, Value, replay, statistic
+from tests.kit.fleet_traffic import Robot, measure_traffic
 
 Assembly = Any
 Period = Mapping[str, Sequence[float]]

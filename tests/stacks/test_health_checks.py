@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_data_service import Service, small_settings
 
 import client_sdk
 from rse_pf.auth.tokens import SigningKey
@@ -27,7 +26,8 @@ from rse_pf.errors import StoreError
 from rse_pf.pnp.problems import make_problem
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, cloud_checks
 from rse_pf.storage.object_store import MemoryStore, digest_of
-from tests.stacks.played_s3 import PlayedS3
+from tests.kit.fake_data_service import Service, small_settings
+from tests.kit.fake_s3 import PlayedS3
 
 Assembly = Any
 BUCKET = "maps"

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from data_process import DataProcess
+
+from tests.kit.data_process import DataProcess
 
 Assembly = Any
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import NoRoom
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
@@ -17,6 +16,7 @@ from rse_pf.aws.money.costs import HOURS, bill_of, parked
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
+from tests.kit.emulated_aws import NoRoom
 
 REGION = "ap-northeast-2"
 MARK = "needs an account"

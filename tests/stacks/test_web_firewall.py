@@ -9,7 +9,7 @@ import pytest
 from client_sdk.network.dial_errors import http_status_error
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.config.resource_names import ROSBRIDGE_PATH
-from tests.played_firewall import PlayedFirewall, rules_of_settings, rules_of_template
+from tests.kit.fake_firewall import PlayedFirewall, rules_of_settings, rules_of_template
 
 SITE = "203.0.113.7"
 PATHS = ["/ws", ROSBRIDGE_PATH, "/", "/healthz", "/%64ata/v1", "//data/v1/maps", "/data/v1/maps", "/burst"]

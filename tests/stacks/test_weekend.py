@@ -14,7 +14,6 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 import pytest
-from emulated_aws import REGION, emulated_aws
 
 from rse_pf.aws.fleet.metrics import dimensions_of
 from rse_pf.aws.lifecycle import idle
@@ -23,7 +22,8 @@ from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.parking import empty_group, silence_alarms, write_note
 from rse_pf.aws.lifecycle.plan import Step
 from rse_pf.config.cloud_layout import RESUME_FIELD
-from tests.aws.lifecycle.account_on_moto import NAMES, Formation, Killer, account_of
+from tests.kit.account_on_moto import NAMES, Formation, Killer, account_of
+from tests.kit.emulated_aws import REGION, emulated_aws
 from tests.stacks.test_alarm_states import alarms_in, states, well
 
 Assembly = Any

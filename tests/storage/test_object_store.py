@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import pytest
-from emulated_aws import REGION, emulated_aws
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -36,6 +35,7 @@ from rse_pf.storage.object_store import (
     digest_of,
     open_store,
 )
+from tests.kit.emulated_aws import REGION, emulated_aws
 
 STORES: dict[str, Callable[[Path], ObjectStore]] = {
     "directory": lambda folder: DirectoryStore(folder / "objects"),

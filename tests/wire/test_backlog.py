@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from wire.client_sessions import CODEC, commands, make_session, open_connection
 
 from rse_pf.wire import Failure, Result
 from rse_pf.wire.client_session import ClientSession, ConnectionState
 from rse_pf.wire.rate_limit import Backlog, is_long_outage, send_order
+from tests.kit.client_sessions import CODEC, commands, make_session, open_connection
 
 ROOM = 8
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from wire.client_sessions import open_connection
 
 from rse_pf.config import SessionSettings
 from rse_pf.limits.token_bucket import TokenBucket
 from rse_pf.wire import Command, Limits, Ping, Result, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
 from rse_pf.wire.rate_limit import RateLimiter
+from tests.kit.client_sessions import open_connection
 
 CODEC = make_codec("json")
 RATE = {"max_commands_per_s": 20.0, "command_burst": 40}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-import server_sessions
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
@@ -32,6 +31,7 @@ from rse_pf.wire.server_session import (
     ServerSession,
     Submit,
 )
+from tests.kit import server_sessions
 
 LIMITS = SessionSettings(max_in_flight=2, max_message_bytes=2048)
 MAX_BAD_MESSAGES = 2

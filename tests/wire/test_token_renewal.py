@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 
 import pytest
-import server_sessions
-from wire.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
 from rse_pf.wire import Failure, Hello, Renew, Renewed, Welcome
 from rse_pf.wire.client_session import ClientSession, ConnectionState, RenewalDue
 from rse_pf.wire.renewal_timer import RenewalTimer
 from rse_pf.wire.server_session import RENEWAL_PAUSE_S, Renewal, Send, ServerSession
+from tests.kit import server_sessions
+from tests.kit.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
 
 def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcome]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 import pytest
-import server_sessions
 from clients.undecodable import BINARY, JSON, Kind
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +16,7 @@ from rse_pf.wire import CODECS, Codec, Command, Failure, Hello, Subscribe, make_
 from rse_pf.wire.envelope import undecodable_id
 from rse_pf.wire.server_codec import make_server_codec
 from rse_pf.wire.server_session import MAX_BAD_MESSAGES, Close, SendRefusal, ServerSession, Submit
+from tests.kit import server_sessions
 
 LIMITS = SessionSettings()
 GOOD = Command(id=1, service="echo", payload=1)

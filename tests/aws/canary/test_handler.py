@@ -13,7 +13,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from fake_platform import FakePlatform
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.aws.canary import handler as canary
@@ -23,6 +22,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, ConnectError, Expired, InternalError, UsageError
 from rse_pf.service import Registry
 from rse_pf.services import pnp
+from tests.kit.fake_platform import FakePlatform
 
 SETTINGS = PlatformSettings()
 TRACE = "0af7651916cd43dd8448eb211c80319c"

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from botocore.exceptions import ClientError
 
 from rse_pf.audit.log import log_files, log_names, read_logs, record_once
@@ -21,6 +20,7 @@ from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
 from rse_pf.errors import RsePfError, StoreError
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore
+from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
 KEYS = SigningKey.from_seed(b"k" * 32, "test-key").key_set().to_json().encode()
 PAGE = 'rse_pf_requests_total{{result="ok",service="pnp"}} {requests}\nrse_pf_robots {robots}\n'

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import boto3
-from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from botocore.stub import Stubber
 
 from rse_pf.audit.log import SYNC_S
@@ -14,6 +13,7 @@ from rse_pf.aws.fleet.task import Phase
 from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, DRAIN_S, time_to_notice_s
+from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
 SETTINGS = PlatformSettings()
 

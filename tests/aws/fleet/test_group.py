@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
-from emulated_aws import REGION, emulated_aws
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.clients import make_client
@@ -26,6 +24,8 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import NAMESPACE
+from tests.kit.emulated_aws import REGION, emulated_aws
+from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
 GROUP = ResourceNames().group
 SETTINGS = PlatformSettings()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from botocore.exceptions import ClientError
 
 from rse_pf.aws.fleet.agent import Agent, AgentContext
@@ -16,6 +15,7 @@ from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S, BOOT_S, ready_within_s, retry_within_s
+from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
 SETTINGS = PlatformSettings()
 LAUNCH, DRAIN = "launch", "drain"

@@ -7,7 +7,6 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, agent_context
 
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent
@@ -17,7 +16,8 @@ from rse_pf.aws.fleet.tasks import rebalancing, server_metrics, spot_notice
 from rse_pf.aws.fleet.tasks.rebalancing import read_totals
 from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import CPU, NAMESPACE
-from tests.aws.fleet.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
+from tests.kit.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
+from tests.kit.fake_machine import FakeMachine, agent_context
 
 FAST = PlatformSettings.from_dict({"scaling": {"profile": "fast"}})
 PAPER = PlatformSettings()

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from aws.fleet.fake_machine import FakeMachine, agent_context
 
 from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.task import Task
 from rse_pf.aws.fleet.tasks import services
 from rse_pf.services.custom.publishing import LIST_NAME, PublishedList, PublishedService, archive_name
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_machine import FakeMachine, agent_context
 
 
 class Setup:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, agent_context
 
 from rse_pf.aws.fleet import instance
 from rse_pf.aws.fleet.agent import TASKS, Agent
@@ -18,6 +17,7 @@ from rse_pf.aws.fleet.task import AgentState, Phase
 from rse_pf.aws.fleet.tasks import store_errors
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
+from tests.kit.fake_machine import FakeMachine, agent_context
 
 
 class CloudWatch:

@@ -17,7 +17,7 @@ from rse_pf.aws.lifecycle.deployment import read_deployment
 from rse_pf.aws.lifecycle.idle import Hour, is_idle, park_if_idle
 from rse_pf.aws.lifecycle.plan import plan_park, plan_resume
 from rse_pf.errors import ConfigurationError
-from tests.aws.lifecycle.account_on_moto import NAMES, SETTINGS, Formation, Killer, account_of
+from tests.kit.account_on_moto import NAMES, SETTINGS, Formation, Killer, account_of
 
 SILENT = Hour(requests=None, robots=None)
 IDLE = Hour(requests=0.0, robots=0.0)

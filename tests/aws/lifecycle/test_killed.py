@@ -13,7 +13,7 @@ from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.plan import Step, plan_down, plan_park, plan_resume, plan_up
 from rse_pf.aws.lifecycle.proof import prove
 from rse_pf.aws.money.prices import load_prices
-from tests.aws.lifecycle.account_on_moto import NAMES, SETTINGS, Formation, Killed, Killer, account_of
+from tests.kit.account_on_moto import NAMES, SETTINGS, Formation, Killed, Killer, account_of
 
 Plan = Callable[[Deployment], list[Step]]
 

@@ -14,7 +14,7 @@ from rse_pf.aws.lifecycle.removal import erase_data
 from rse_pf.aws.money.leftovers import Leftover
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
-from tests.aws.lifecycle.account_on_moto import NAMES, Killer, account_of
+from tests.kit.account_on_moto import NAMES, Killer, account_of
 
 CREATED = datetime(2026, 11, 1, tzinfo=timezone.utc)
 

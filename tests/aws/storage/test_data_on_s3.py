@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fake_data_service import HttpServer, Service, small_settings
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.aws import clients
@@ -18,6 +17,7 @@ from rse_pf.aws.storage import S3Store, open_bucket
 from rse_pf.errors import StoreRefused
 from rse_pf.identity import RobotId, object_name
 from rse_pf.storage.object_store import digest_of
+from tests.kit.fake_data_service import HttpServer, Service, small_settings
 
 BUCKET = "objects"
 FAILING_SHARE = 0.3

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fake_data_service import Service, small_settings
 
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.cli.access.adopt import adopt
@@ -13,6 +12,7 @@ from rse_pf.cli.main import main
 from rse_pf.identity import RobotId, object_name, state_name
 from rse_pf.storage.charges import charge_name
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
+from tests.kit.fake_data_service import Service, small_settings
 
 Capture = pytest.CaptureFixture[str]
 OLD = RobotId("default", "robot-1")

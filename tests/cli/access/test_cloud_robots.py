@@ -14,8 +14,6 @@ from typing import Any
 
 import pytest
 import websockets
-from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
-from guarded_server import GuardedServer
 
 from rse_pf.auth.robot_key import RobotKey
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore, TrustStore
@@ -26,6 +24,8 @@ from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized
 from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.server_session import CLOSE_REVOKED
+from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
+from tests.kit.guarded_server import GuardedServer
 
 Capture = pytest.CaptureFixture[str]
 SETTINGS = AuthSettings()

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_data_service import Service, small_settings
 
 from rse_pf.aws.storage import S3Store
 from rse_pf.cli.main import main
 from rse_pf.local.state import settings_file
 from rse_pf.storage.object_store import DirectoryStore, ObjectStore, digest_of
+from tests.kit.fake_data_service import Service, small_settings
 
 Capture = pytest.CaptureFixture[str]
 MIB = 1 << 20

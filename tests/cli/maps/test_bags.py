@@ -23,8 +23,8 @@ from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
 from tests.cli.maps.test_from_camera import PLATFORM, SolvingRobot
-from tests.client_sdk.bags.small_bags import camera_info, raw_image, stamp_of, transforms
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+from tests.kit.flat_world import CAMERA, STEP_M, frame_at
+from tests.kit.small_bags import camera_info, raw_image, stamp_of, transforms
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[bags]'")
 pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")

@@ -27,10 +27,10 @@ from rse_pf.cli.maps.frame_table import FrameTable
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.storage.quotas import set_own_quota
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.tum_recording import write_tum  # noqa: E402
+from tests.kit.tum_recording import write_tum  # noqa: E402
 
 
 class SolvingRobot:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_data_service import HttpServer, Service, small_settings
 
 from rse_pf.cli.main import main
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId
 from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_data_service import HttpServer, Service, small_settings
 
 POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
 OK = PhotoLocation(

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_data_service import Service, small_settings
-from maps.sample_maps import make_map
 
 from rse_pf.aws.storage import S3Store
 from rse_pf.cli.main import main
@@ -20,6 +18,8 @@ from rse_pf.maps.registry import MapRegistry
 from rse_pf.maps.removal import choose_superseded
 from rse_pf.storage.charges import charge_name, sum_charges
 from rse_pf.storage.object_store import DirectoryStore, ObjectStore, digest_of
+from tests.kit.fake_data_service import Service, small_settings
+from tests.kit.sample_maps import make_map
 
 Capture = pytest.CaptureFixture[str]
 ROBOT = RobotId("acme", "robot-1")

@@ -8,12 +8,12 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from hostile.hostile_maps import DAMAGED_PROVENANCE, DECODABLE, hostile_maps
 
 from rse_pf.cli.main import main
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
 from rse_pf.storage.object_store import DirectoryStore, digest_of
+from tests.kit.hostile_maps import DAMAGED_PROVENANCE, DECODABLE, hostile_maps
 
 _CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 

@@ -13,7 +13,7 @@ from rse_pf.geometry import Camera, pose_difference
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 for package in ("gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")

@@ -22,7 +22,7 @@ from rse_pf.storage.object_store import DirectoryStore
 from tests.cli.maps.test_bags import folder
 from tests.cli.maps.test_from_camera import PLATFORM
 from tests.cli.maps.test_from_camera import folder as video_folder
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")
@@ -217,7 +217,7 @@ def test_a_wrong_name_of_a_map_is_refused_before_the_drive(
 
 
 def commit(objects: Path, name: str) -> None:
-    from maps.sample_maps import make_map
+    from tests.kit.sample_maps import make_map
 
     data = encode_map(make_map())
     assert decode_map(data).keyframes

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 
 from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
 from rse_pf.services.custom.installed import installed_services
 from rse_pf.services.custom.publishing import LIST_NAME
+from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
 Capture = pytest.CaptureFixture[str]
 

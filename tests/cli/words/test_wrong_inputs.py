@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cli.wrong_inputs import WRONG_INPUTS, WrongInput, make_files
 
 from rse_pf.cli.main import main
+from tests.kit.wrong_inputs import WRONG_INPUTS, WrongInput, make_files
 
 TYPED_IN_A_SHELL = ("demos", "settings --settings misspelt.json", "map list --store dir:/typo")
 AS_PROCESSES = [each for each in WRONG_INPUTS if each.typed in TYPED_IN_A_SHELL]

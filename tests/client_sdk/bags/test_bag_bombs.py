@@ -13,7 +13,7 @@ from client_sdk.bags import BagKind, BagWriter, decompression, open_bag
 from client_sdk.bags.bag_file import BrokenMessage, open_bag_file
 from client_sdk.bags.message_types import IMAGE
 from rse_pf.errors import UsageError
-from tests.client_sdk.bags.small_bags import KINDS, Message, raw_image, stamp_of, write_bag
+from tests.kit.small_bags import KINDS, Message, raw_image, stamp_of, write_bag
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[bags]'")
 pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")

@@ -21,8 +21,8 @@ from client_sdk.bags.poses import PoseTopic
 from client_sdk.bags.registration import register_depth
 from client_sdk.datasets import open_dataset
 from rse_pf.geometry import Camera, rotation_angle_deg
-from tests.client_sdk.bags.recorded_bags import write_recording
-from tests.client_sdk.bags.small_bags import (
+from tests.kit.recorded_bags import write_recording
+from tests.kit.small_bags import (
     COLOUR,
     CX,
     CY,

@@ -18,7 +18,8 @@ from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse
-from tests.client_sdk.bags.small_bags import (
+from tests.client_sdk.bags.test_stereo_bags import CAMERA, raw_pair, true_rig
+from tests.kit.small_bags import (
     FRAMES,
     KINDS,
     PERIOD_NS,
@@ -27,7 +28,6 @@ from tests.client_sdk.bags.small_bags import (
     stamp_of,
     write_bag,
 )
-from tests.client_sdk.bags.test_stereo_bags import CAMERA, raw_pair, true_rig
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[bags]'")
 pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")

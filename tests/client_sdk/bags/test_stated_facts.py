@@ -20,7 +20,8 @@ from client_sdk.bags.message_types import (  # noqa: E402
     TRANSFORM,
 )
 from rse_pf.errors import UsageError  # noqa: E402
-from tests.client_sdk.bags.small_bags import (  # noqa: E402
+from tests.kit.flat_world import CAMERA, frame_at  # noqa: E402
+from tests.kit.small_bags import (  # noqa: E402
     COLOUR,
     CX,
     CY,
@@ -38,7 +39,6 @@ from tests.client_sdk.bags.small_bags import (  # noqa: E402
     stamp_of,
     write_bag,
 )
-from tests.client_sdk.mapper.flat_world import CAMERA, frame_at  # noqa: E402
 
 INFO = "/camera/color/camera_info"
 COLOURS_MM = (-150.0, 0.0, 0.0)

@@ -18,7 +18,7 @@ from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse
-from tests.client_sdk.bags.small_bags import (
+from tests.kit.small_bags import (
     CX,
     CY,
     DEPTH,

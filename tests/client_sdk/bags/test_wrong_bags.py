@@ -14,7 +14,7 @@ from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from rse_pf.cli.main import main
 from rse_pf.errors import RsePfError, UsageError
-from tests.client_sdk.bags.small_bags import (
+from tests.kit.small_bags import (
     COLOUR,
     DEPTH,
     FIRST_KINDS,

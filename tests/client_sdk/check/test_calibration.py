@@ -6,12 +6,12 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from made_drives import Made, make_store
 
 from client_sdk.check.calibration import CalibrationJudgement, _Errors, judge_calibration
 from client_sdk.check.drive_model import DepthReading, drive_model
 from client_sdk.check.findings import FaultKind, Finding, order
 from client_sdk.check.keyframes import KeyframeStore, tracks_of
+from tests.kit.rendered_drives import Made, make_store
 
 
 def judged(made: Made) -> CalibrationJudgement:

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from made_drives import Made, make_store
 
 from client_sdk.check.calibration import judge_calibration
 from client_sdk.check.findings import FaultKind
+from tests.kit.rendered_drives import Made, make_store
 
 FOCAL, PRINCIPAL = FaultKind.FOCAL_LENGTH, FaultKind.PRINCIPAL_POINT
 OFFSET, DELAY, MOVING = FaultKind.DEPTH_OFFSET, FaultKind.DEPTH_DELAY, FaultKind.MOVING_FOCAL_LENGTH

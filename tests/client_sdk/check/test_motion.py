@@ -18,7 +18,7 @@ from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, exp_se3, from_quaternion, to_quaternion
-from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion, SimulatedImu
+from tests.kit.inertial_drive import InertialDrive, Motion, SimulatedImu
 
 MODEL = ImuModel(
     T_imu_camera=np.eye(4), gyro_noise=1e-3, gyro_walk=1e-5, accel_noise=1e-2, accel_walk=1e-4, rate_hz=200.0

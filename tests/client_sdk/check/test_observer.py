@@ -16,7 +16,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.samples import ImuModel
 from client_sdk.simulator import make_world, render_along, true_trajectory
 from client_sdk.trajectory import Trajectory
-from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion
+from tests.kit.inertial_drive import InertialDrive, Motion
 
 SEED, FRAMES, RATE_HZ = 1, 60, 10.0
 

@@ -13,7 +13,7 @@ from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.preintegration import preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.geometry import Array, exp_se3, exp_so3
-from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion, SimulatedImu
+from tests.kit.inertial_drive import InertialDrive, Motion, SimulatedImu
 
 MODEL = ImuModel(
     T_imu_camera=exp_se3(np.array([0.05, -0.02, 0.01, 0.3, -1.2, 0.8])),

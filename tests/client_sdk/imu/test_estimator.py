@@ -13,7 +13,7 @@ from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.geometry import Array, Camera, exp_se3, exp_so3, inverse, rotation_angle_deg
 from rse_pf.slam.inertial import upright_rotation
-from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion, SimulatedImu
+from tests.kit.inertial_drive import InertialDrive, Motion, SimulatedImu
 
 CAMERA = Camera(fx=460.0, fy=460.0, cx=375.5, cy=239.5, width=752, height=480)
 MODEL = ImuModel(

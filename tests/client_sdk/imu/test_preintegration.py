@@ -10,7 +10,7 @@ from client_sdk.imu.preintegration import preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.errors import UsageError
 from rse_pf.geometry import exp_se3, exp_so3, left_jacobian_so3, log_so3, right_jacobian_so3
-from tests.client_sdk.imu.inertial_drive import GRAVITY, InertialDrive, Motion, SimulatedImu
+from tests.kit.inertial_drive import GRAVITY, InertialDrive, Motion, SimulatedImu
 
 MODEL = ImuModel(
     T_imu_camera=exp_se3(np.array([0.05, -0.02, 0.01, 0.3, -1.2, 0.8])),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.client_sdk.live.fake_live_map import FakeLiveRobot
+from tests.kit.fake_live_map import FakeLiveRobot
 
 
 @pytest.fixture

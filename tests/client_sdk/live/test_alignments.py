@@ -9,7 +9,7 @@ from client_sdk.live.alignments import Alignments
 from rse_pf.errors import BadMessage
 from rse_pf.geometry import exp_se3
 from rse_pf.wire.live_map import RelocaliseReply
-from tests.client_sdk.live.fake_live_map import alignment
+from tests.kit.fake_live_map import alignment
 
 FIRST, SECOND = exp_se3([1.0, 0, 0, 0, 0, 0]), exp_se3([1.1, 0, 0, 0, 0, 0])
 

@@ -16,9 +16,9 @@ from client_sdk.live.attachments import encode_keyframe_points
 from rse_pf.errors import ConnectError, Forbidden, UsageError
 from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.keyframe_points import decode_points
-from tests.client_sdk.live.fake_live_map import FakeLiveRobot, solve
 from tests.client_sdk.live.test_live_mapper import QUICK, drive
-from tests.client_sdk.mapper.flat_world import CAMERA, DEPTHS_M, frame_at
+from tests.kit.fake_live_map import FakeLiveRobot, solve
+from tests.kit.flat_world import CAMERA, DEPTHS_M, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

@@ -28,8 +28,8 @@ from rse_pf.errors import BadRequest, Busy, Forbidden, MissingExtra, UsageError
 from rse_pf.geometry import exp_se3
 from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, make_codec
-from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, failing, solve
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, covered, foreign, frame_at
+from tests.kit.fake_live_map import FakeLiveRobot, alignment, failing, solve
+from tests.kit.flat_world import CAMERA, STEP_M, covered, foreign, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

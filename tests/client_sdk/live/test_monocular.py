@@ -18,9 +18,9 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
 from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.tracking import Features
-from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, solve
-from tests.client_sdk.live.shared_map import SharedMap
-from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, foreign, frame_at
+from tests.kit.fake_live_map import FakeLiveRobot, alignment, solve
+from tests.kit.flat_world import DEPTHS_M, STEP_M, foreign, frame_at
+from tests.kit.shared_map import SharedMap
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

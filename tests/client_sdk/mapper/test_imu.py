@@ -13,8 +13,8 @@ from client_sdk.imu.estimator import ImuEstimator
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from client_sdk.mapper import Mapper
 from rse_pf.geometry import Array, exp_se3, inverse
-from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, frame_at, tracked
+from tests.kit.fake_live_map import solve
+from tests.kit.flat_world import STEP_M, frame_at, tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

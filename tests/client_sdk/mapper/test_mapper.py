@@ -28,8 +28,8 @@ from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
-from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, foreign, frame_at, tracked
+from tests.kit.fake_live_map import solve
+from tests.kit.flat_world import STEP_M, foreign, frame_at, tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

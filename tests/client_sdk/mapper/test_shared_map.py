@@ -15,9 +15,9 @@ from client_sdk.mapper import Mapper
 from rse_pf.errors import UsageError
 from rse_pf.maps.format import decode_map
 from rse_pf.services.mapping.merge import MergeReply
-from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import frame_at
 from tests.client_sdk.mapper.test_mapper import drive
+from tests.kit.fake_live_map import solve
+from tests.kit.flat_world import frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

@@ -23,7 +23,7 @@ from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Camera, inverse, transform
 from rse_pf.maps.format import decode_map
 from rse_pf.pnp import DepthNoise
-from tests.client_sdk.mapper.flat_world import tracked
+from tests.kit.flat_world import tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

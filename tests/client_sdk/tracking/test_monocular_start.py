@@ -19,9 +19,9 @@ from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3
-from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import frame_at, tracked
-from tests.client_sdk.tracking.driving import run_all
+from tests.kit.fake_live_map import solve
+from tests.kit.flat_world import frame_at, tracked
+from tests.kit.tracked_drives import run_all
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

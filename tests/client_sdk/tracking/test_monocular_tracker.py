@@ -20,8 +20,8 @@ from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import Features
-from tests.client_sdk.mapper.flat_world import CAMERA, covered, foreign, frame_at
-from tests.client_sdk.tracking.driving import run, run_all, solve
+from tests.kit.flat_world import CAMERA, covered, foreign, frame_at
+from tests.kit.tracked_drives import run, run_all, solve
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

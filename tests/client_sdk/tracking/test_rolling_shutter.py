@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import Observations, fit_readout_change
-from tests.client_sdk.tracking.driving import run
+from tests.kit.tracked_drives import run
 
 READOUT_S, INTERVAL_S = 0.03, 1.0 / 30.0
 RATE = np.array([0.9, -1.1, 0.4])

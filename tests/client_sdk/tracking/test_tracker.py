@@ -15,8 +15,8 @@ from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference
-from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, covered, foreign, frame_at
-from tests.client_sdk.tracking.driving import NO_ANSWER, Answer, run, run_all, solve
+from tests.kit.flat_world import DEPTHS_M, STEP_M, covered, foreign, frame_at
+from tests.kit.tracked_drives import NO_ANSWER, Answer, run, run_all, solve
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_data_service import HttpServer, Service, small_settings
 
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import SigningKey
@@ -15,6 +14,7 @@ from rse_pf.enrolment import Enrolment
 from rse_pf.errors import Conflict, UsageError
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_data_service import HttpServer, Service, small_settings
 
 
 def encoded(points: int) -> bytes:

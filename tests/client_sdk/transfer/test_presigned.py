@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from fake_data_service import HttpServer, Service, small_settings
 
 from client_sdk.transfer.data_client import DataClient, DataOptions, is_allowed
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_data_service import HttpServer, Service, small_settings
 
 DATA = random.Random(1).randbytes(700_000)
 DIGEST = digest_of(DATA)

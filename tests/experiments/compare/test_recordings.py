@@ -9,7 +9,7 @@ import pytest
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.compare import recordings
 from rse_pf.extensions.experiments.compare.recordings import drives_of
-from tests.experiments.compare.recordings import flat_drive
+from tests.kit.compare_recordings import flat_drive
 
 
 @pytest.fixture

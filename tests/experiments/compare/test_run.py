@@ -22,7 +22,7 @@ from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 from rse_pf.extensions.experiments.compare.tracking_run import track
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
-from tests.experiments.compare.recordings import black, flat_drive
+from tests.kit.compare_recordings import black, flat_drive
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 image = pytest.importorskip("PIL.Image")

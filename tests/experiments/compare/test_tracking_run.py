@@ -16,7 +16,7 @@ from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 from rse_pf.extensions.experiments.compare.tracking_run import TrackingRun, longest_gap_s, track
 from tests.client_sdk.mapper.test_imu import leaning_first, with_imu  # noqa: F401
-from tests.experiments.compare.recordings import black, flat_drive
+from tests.kit.compare_recordings import black, flat_drive
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

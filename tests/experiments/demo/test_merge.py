@@ -15,7 +15,7 @@ from rse_pf.errors import CommandFailed
 from rse_pf.extensions.experiments.demo.merge import MAP_FILE, MERGED_MAP, print_tenths, write_merged
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.services.mapping.merge import MergeReply, MergeRequest, merge_maps
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 for package in ("gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")

@@ -17,7 +17,7 @@ from rse_pf.extensions.experiments.results.map_error import (
 from rse_pf.geometry import exp_se3, inverse
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply, NotJoined, Refusal
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 WORLD = make_world(1)
 REPLY = MergeReply(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 
 import pytest
-from fake_data_service import Service, small_settings
 
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_data_service import Service, small_settings
 
 ROBOTS = 50
 

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, RsePfError
+from tests.kit.fake_platform import FakePlatform
 
 pytestmark = pytest.mark.system
 

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
-from guarded_server import GuardedServer
 
 from client_sdk import Robot, connect
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = pytest.mark.system
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import websockets
-from guarded_server import GuardedServer
 
 from client_sdk import Robot, connect
 from rse_pf.auth.robot_key import RobotKey, make_robot_key
@@ -21,6 +20,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.errors import Forbidden, Unauthorized
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Renewed, Result, make_codec
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = pytest.mark.system
 

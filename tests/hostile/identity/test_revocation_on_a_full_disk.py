@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from guarded_server import GuardedServer
 
 from client_sdk import connect
 from rse_pf.auth.roster import DenyList
 from rse_pf.errors import RsePfError
 from rse_pf.local.disk_watch import DiskWatch, access_control_store
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = pytest.mark.system
 

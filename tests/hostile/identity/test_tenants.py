@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
 
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.identity import object_name
 from rse_pf.storage.object_store import DirectoryStore, digest_of
 from rse_pf.wire import Command, Failure, Result
-from tests.hostile.attacks import AttackTarget
-from tests.hostile.identity import tenants
+from tests.kit import tenants
+from tests.kit.attacks import AttackTarget
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = pytest.mark.system
 

@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from guarded_server import KEY, GuardedServer
 
 from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster, public_key_of
 from rse_pf.auth.tokens import SigningKey
+from tests.kit.guarded_server import KEY, GuardedServer
 
 pytestmark = pytest.mark.system
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from recording.replay.made import START_NS, Made, jpeg
 
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.extensions.recording import file_format, reader
 from rse_pf.extensions.recording.reader import open_recording
 from rse_pf.extensions.recording.summary import Wanted
 from rse_pf.wire import Command, Failure, Result
+from tests.kit.recorded_sessions import START_NS, Made, jpeg
 
 
 def test_commands_come_with_their_answers_in_the_order_in_which_they_were_answered(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from guarded_server import GuardedServer
 
 from client_sdk import connect
 from rse_pf.config import PlatformSettings
@@ -19,6 +18,7 @@ from rse_pf.extensions.recording.replay import run
 from rse_pf.extensions.recording.replay.limited import LimitedReplay
 from rse_pf.pnp.problems import DEGENERATE, make_degenerate, make_problem
 from rse_pf.wire import CODECS
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

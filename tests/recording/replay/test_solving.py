@@ -9,7 +9,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from recording.replay.made import START_NS, Made
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest
@@ -19,6 +18,7 @@ from rse_pf.extensions.recording.replay.solving import TIMES_AND_PLACES, Overrid
 from rse_pf.geometry import exp_se3, transform
 from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
 from rse_pf.wire import Failure, Result, make_codec
+from tests.kit.recorded_sessions import START_NS, Made
 
 SETTINGS = PlatformSettings()
 

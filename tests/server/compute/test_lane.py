@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import msgspec
 import pytest
-from fakes import FakeWire
 from server.compute.test_limited_services import ScriptedProcesses, reply_of
-from server.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.errors import Crashed
 from rse_pf.service import Registry
 from rse_pf.wire import Command, Failure, Result
+from tests.kit.fakes import FakeWire
+from tests.kit.worker_parts import WorkerParts, worker_parts
 
 
 class Map(msgspec.Struct, frozen=True, kw_only=True):

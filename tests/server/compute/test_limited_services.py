@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from server.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.errors import Busy, WorkerLost
 from rse_pf.identity import RobotId
@@ -15,6 +14,7 @@ from rse_pf.processes.limited import Overran
 from rse_pf.server.compute.limited_services import LimitedServices
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.wire import Command, Failure, Result
+from tests.kit.worker_parts import WorkerParts, worker_parts
 
 ALICE, BOB = RobotId("default", "alice"), RobotId("default", "bob")
 

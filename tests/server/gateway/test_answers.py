@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from server.gateway.worker_parts import worker_parts
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.wire import Command, Failure, Result
+from tests.kit.worker_parts import worker_parts
 
 
 def test_the_time_that_a_job_waited_is_not_the_servers_clock() -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fakes import FakeLoop
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,6 +15,7 @@ from rse_pf.identity import RobotId
 from rse_pf.server.gateway.audit_recorder import AuditRecorder, ServerAudit
 from rse_pf.server.gateway.handshake import Accepted, Rejected
 from rse_pf.server.ports import Clocks
+from tests.kit.fakes import FakeLoop
 
 ROBOT = RobotId("default", "robot-1")
 CLAIMS = Claims(robot=ROBOT, token_id="t-1", issued_s=1.0, expires_s=900.0, key_id="k-1")

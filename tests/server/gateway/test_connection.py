@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fakes import FakeWire
 from msgspec import Raw
-from server.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.server.log import JsonLog
 from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
 from rse_pf.wire.server_session import MAX_BAD_MESSAGES
+from tests.kit.fakes import FakeWire
+from tests.kit.worker_parts import WorkerParts, worker_parts
 
 SETTINGS = PlatformSettings()
 CODEC = make_codec("zlib")

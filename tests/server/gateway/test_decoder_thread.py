@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fakes import FakeLoop
 
 from rse_pf.errors import LimitExceeded
 from rse_pf.server.gateway.decoder_thread import DecoderThread
 from rse_pf.server.ports import NoCrashMarks
+from tests.kit.fakes import FakeLoop
 
 DEADLINE_S = 10.0
 

@@ -8,9 +8,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from fakes import FakeLoop, FakeWire
-from server.gateway.worker_parts import BINARY, UNIX_S, WorkerParts, worker_parts
-from server.scheduling.admitted import measure_turns, queued
 
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId, object_name
@@ -21,6 +18,9 @@ from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.service import Registry
 from rse_pf.storage.object_store import MemoryStore, digest_of
 from rse_pf.wire import Cancel, Command, Failure, Move, Ping, Pong, Result, Welcome
+from tests.kit.admitted_commands import measure_turns, queued
+from tests.kit.fakes import FakeLoop, FakeWire
+from tests.kit.worker_parts import BINARY, UNIX_S, WorkerParts, worker_parts
 
 SETTINGS = PlatformSettings()
 

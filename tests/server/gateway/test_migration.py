@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from fakes import FakeLoop
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.server.gateway.migration import Migration, plan
+from tests.kit.fakes import FakeLoop
 
 
 class Connection:

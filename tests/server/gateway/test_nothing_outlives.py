@@ -6,14 +6,14 @@ import gc
 from collections.abc import Callable
 
 import pytest
-from fakes import FakeLoop
-from server.gateway.worker_parts import WorkerParts, quiet_log, worker_parts
-from server.live_map.fake_client import FakeReader
 
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.live_map.subscriptions import Subscriptions
 from rse_pf.server.log import JsonLog
 from rse_pf.wire import Command
+from tests.kit.fake_map_client import FakeReader
+from tests.kit.fakes import FakeLoop
+from tests.kit.worker_parts import WorkerParts, quiet_log, worker_parts
 
 TIMES = 20
 

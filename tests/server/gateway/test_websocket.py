@@ -5,11 +5,11 @@ from __future__ import annotations
 import errno
 from types import SimpleNamespace
 
-from fakes import FakeLoop
 from picows import picows
 
 from rse_pf.server.gateway.socket_poller import SocketPoller
 from rse_pf.server.gateway.websocket import Listener, RobotProtocol
+from tests.kit.fakes import FakeLoop
 
 
 async def test_the_protocol_takes_the_options_that_we_give_it():

@@ -26,7 +26,7 @@ from rse_pf.server.jobs.slots import JobSlots, make_slot_file
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
-from tests.fakes import FakeLog, FakeLoop
+from tests.kit.fakes import FakeLog, FakeLoop
 
 WAIT_S = 20.0
 

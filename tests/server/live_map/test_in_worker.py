@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from server.gateway.worker_parts import BINARY, WorkerParts, worker_parts
-from server.live_map.fake_client import FakeLiveMapClient
 
 from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.connection import RobotConnection
@@ -15,6 +13,8 @@ from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.ports import WorkerContext
 from rse_pf.wire import Command, Failure, Hello, Subscribe, Unsubscribe, Update
 from rse_pf.wire.server_session import MAX_SUBSCRIPTIONS
+from tests.kit.fake_map_client import FakeLiveMapClient
+from tests.kit.worker_parts import BINARY, WorkerParts, worker_parts
 
 HELLO = Hello(capabilities=("updates",))
 
@@ -47,7 +47,7 @@ class Worker(WorkerParts):
 
 @pytest.fixture
 def worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[Worker]:
-    monkeypatch.setattr("server.gateway.worker_parts.WorkerParts", Worker)
+    monkeypatch.setattr("tests.kit.worker_parts.WorkerParts", Worker)
     with worker_parts() as parts:
         assert isinstance(parts, Worker)
         yield parts

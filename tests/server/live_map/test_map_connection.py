@@ -9,8 +9,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from fakes import FakeLog
-
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
@@ -21,7 +19,8 @@ from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnecti
 from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerPool, MapServerProcess
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
-from tests.server.live_map.fake_map import keyframe_request
+from tests.kit.fake_map import keyframe_request
+from tests.kit.fakes import FakeLog
 
 LEASE = lease_name("default", "warehouse")
 FIRST = KeyframeRequest(map="warehouse", segment=0, number=0, keyframe=b"")

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from server.gateway.worker_parts import quiet_log
-from server.live_map.fake_client import FakeLiveMapClient, FakeReader
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
@@ -28,6 +26,8 @@ from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, Failure, Result, Update
 from rse_pf.wire.live_map import KeyframeRequest
+from tests.kit.fake_map_client import FakeLiveMapClient, FakeReader
+from tests.kit.worker_parts import quiet_log
 
 CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
 POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]

@@ -11,7 +11,6 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from guarded_server import KEY, GuardedServer
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
@@ -25,6 +24,7 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire import SUBPROTOCOLS, make_codec, messages
 from rse_pf.wire.server_session import CLOSE_PROTOCOL, UPDATES
+from tests.kit.guarded_server import KEY, GuardedServer
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import FakeLog, FakeLoop
-from server.live_map.fake_client import FakeReader
 
 from rse_pf.errors import Forbidden, RsePfError
 from rse_pf.server.live_map.subscriptions import Subscriptions
 from rse_pf.wire import CODECS, Failure, Update
+from tests.kit.fake_map_client import FakeReader
+from tests.kit.fakes import FakeLog, FakeLoop
 
 
 class Parts:

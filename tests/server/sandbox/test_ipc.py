@@ -12,7 +12,7 @@ import pytest
 from rse_pf.errors import BadMessage, LimitExceeded
 from rse_pf.processes.ipc import FrameReader, encode_message, encode_reply, receive
 from rse_pf.server.sandbox.channel import IpcChannel
-from tests.fakes import FakeLoop
+from tests.kit.fakes import FakeLoop
 
 MESSAGES: list[Any] = [["ready"], [True, {"count": 1}, b"\x00\x01", 1.5], []]
 

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fakes import FakeLog, FakeLoop
 
 from rse_pf.errors import ConfigurationError
 from rse_pf.identity import RobotId
@@ -18,6 +17,7 @@ from rse_pf.server.sandbox.reloading import ReloadingSandboxes
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Command, Failure, Result
+from tests.kit.fakes import FakeLog, FakeLoop
 
 ROBOT, OTHER = RobotId("default", "r"), RobotId("acme", "r")
 """Two robots of one name."""

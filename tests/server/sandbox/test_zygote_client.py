@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fakes import FakeLog
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.processes.ipc import receive
 from rse_pf.server.sandbox.zygote_client import ZygoteClient
+from tests.kit.fakes import FakeLog
 
 pytestmark = pytest.mark.system
 SETTINGS = PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}})

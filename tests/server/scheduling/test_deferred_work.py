@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from fakes import FakeLoop
 
 from rse_pf.server.scheduling.deferred_work import DeferredWork
+from tests.kit.fakes import FakeLoop
 
 BOUND_S = 0.0005
 

@@ -8,11 +8,11 @@ from collections import Counter
 from dataclasses import dataclass
 
 import pytest
-from server.scheduling.admitted import queued
 
 from rse_pf.identity import RobotId
 from rse_pf.server.scheduling.overload import PAUSE_S, Overload
 from rse_pf.server.scheduling.scheduler import Scheduler
+from tests.kit.admitted_commands import queued
 
 WORK_S, DEADLINE_S, SECONDS = 0.005, 0.25, 12.0
 REFUSAL_S = WORK_S / 2

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from server.scheduling.admitted import AdmittedScheduler, queued
 
 from rse_pf.server.scheduling.scheduler import INLINE_BYTES, Scheduler
+from tests.kit.admitted_commands import AdmittedScheduler, queued
 
 
 def run_order(scheduler: Scheduler, count: int) -> list[tuple[str, int]]:

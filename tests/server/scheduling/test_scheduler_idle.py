@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from server.scheduling.admitted import queued
-
 from rse_pf.server.scheduling.scheduler import Scheduler
+from tests.kit.admitted_commands import queued
 
 
 def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, alone: bool) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from fakes import FakeLoop
-
 from rse_pf.server.supervisor.robot_events import RobotEvents
+from tests.kit.fakes import FakeLoop
 
 LINE_BYTES = 1 << 20
 """The longest line that the supervisor reads of a worker's channel."""

@@ -6,12 +6,11 @@ import asyncio
 import json
 from pathlib import Path
 
-from fakes import FakeLog
-
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.server.supervisor.orders import TrustOrder, WorkerOrder
 from rse_pf.server.supervisor.trust_poller import update_workers
+from tests.kit.fakes import FakeLog
 
 KEYS = SigningKey.from_seed(b"t" * 32, "k1").key_set()
 OTHER_KEYS = SigningKey.from_seed(b"o" * 32, "k2").key_set()

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile.hostile_maps import DECODABLE, hostile_maps
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import LimitExceeded
@@ -22,7 +21,8 @@ from rse_pf.slam import consistency
 from rse_pf.slam.consistency import find_maximum_clique
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import Command, Failure, Result, make_codec
-from tests.synthetic_maps import make_room, make_world
+from tests.kit.hostile_maps import DECODABLE, hostile_maps
+from tests.kit.synthetic_maps import make_room, make_world
 
 REGISTRY = builtin_services(PlatformSettings())
 EYE = np.eye(4).ravel().tolist()

@@ -19,7 +19,7 @@ from rse_pf.services.mapping.wifi import (
     fingerprint_of,
 )
 from rse_pf.wire import Command, Failure, Result
-from tests.synthetic_maps import Building, make_building
+from tests.kit.synthetic_maps import Building, make_building
 
 KEY = b"a key of the team"
 

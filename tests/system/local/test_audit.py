@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from guarded_server import GuardedServer
 
 from rse_pf.audit.entry import Entry
 from rse_pf.audit.log import audit_folder, log_files, log_names, read_entries
@@ -20,6 +19,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import main
 from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
+from tests.kit.guarded_server import GuardedServer
 
 pytestmark = pytest.mark.system
 

@@ -24,8 +24,8 @@ from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.slam.keyframe_points import ObjectReference
 from rse_pf.storage.object_store import DirectoryStore
+from tests.kit.map_server_setup import MAP
 from tests.server.live_map.map_server.test_keyframe_objects import keyframe_request, some_points
-from tests.server.live_map.map_server_bench import MAP
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(180)]
 

@@ -18,7 +18,7 @@ from client_sdk import connect
 from rse_pf.extensions.fleet_page.feeds.live_feed import LiveFeed
 from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.local.firewall import key_file, read_key
-from tests.server.live_map.fake_map import keyframe_bytes
+from tests.kit.fake_map import keyframe_bytes
 
 pytestmark = pytest.mark.system
 

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from guarded_server import KEY
 from server.live_map.test_served import keyframe
 
 import client_sdk
@@ -37,6 +36,7 @@ from rse_pf.server.live_map.connection_security import (
 )
 from rse_pf.server.live_map.lease import LeaseRecord, decode_lease, lease_name
 from rse_pf.storage.object_store import DirectoryStore
+from tests.kit.guarded_server import KEY
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

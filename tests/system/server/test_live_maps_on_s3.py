@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from guarded_server import KEY, GuardedServer
 from server.live_map.test_served import keyframe
 
 import client_sdk
@@ -17,6 +16,7 @@ from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage import open_bucket
 from rse_pf.config import PlatformSettings
 from rse_pf.server.live_map.lease import decode_lease, lease_name
+from tests.kit.guarded_server import KEY, GuardedServer
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

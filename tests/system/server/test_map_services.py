@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_maps import make_room, make_world
 
 import client_sdk
 from rse_pf.geometry import exp_se3, pose_difference
@@ -15,6 +14,7 @@ from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.services.mapping.icp import IcpReply, IcpRequest
 from rse_pf.services.mapping.localise import LocaliseReply, LocaliseRequest
 from rse_pf.services.mapping.place import PlaceReply, PlaceRequest
+from tests.kit.synthetic_maps import make_room, make_world
 
 pytest.importorskip("small_gicp", reason="the extra maps is not installed")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from wire.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
 
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
 from rse_pf.wire import Command, Failure, Hello, Move, Ping, Pong, Result, make_codec
@@ -16,6 +15,7 @@ from rse_pf.wire.client_session import (
     ConnectionState,
     MoveRequested,
 )
+from tests.kit.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
 
 
 def result(command: Command, **stamps: float) -> Result:

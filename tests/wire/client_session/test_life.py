@@ -7,10 +7,10 @@ from collections import Counter
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from wire.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
 from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Result, Welcome
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Notice
+from tests.kit.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
 ROOM = 3
 CODES = ("busy", "worker-lost", "stale", "expired", "internal", "degenerate")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from wire.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
-
 from rse_pf.wire import Cancel, Command, Failure, Progress, Result
 from rse_pf.wire.client_session import Progressed
+from tests.kit.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
 
 
 def result(command: Command) -> Result:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from server.scheduling.admitted import queued
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.server.gateway.admission import Admission
 from rse_pf.server.scheduling.scheduler import QueueBacklog
+from tests.kit.admitted_commands import queued
 
 ADMITTED: dict[str, Any] = {
     "queued": queued("r", within=1.0), "claims": None, "backlog": QueueBacklog(),

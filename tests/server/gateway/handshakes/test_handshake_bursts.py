@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-from server.gateway.worker_parts import WorkerParts, quiet_log
 
 from rse_pf.config import PlatformSettings
 from rse_pf.server.gateway.audit_recorder import AuditRecorder
 from rse_pf.server.gateway.websocket import RobotSockets
+from tests.kit.worker_parts import WorkerParts, quiet_log
 
 HANDSHAKE_S, ROUND_S = 2e-4, 1e-3
 REQUEST = b"GET /nothing HTTP/1.1\r\nHost: a\r\n\r\n"

@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fakes import FakeWire
-from server.gateway.worker_parts import UNIX_S, WorkerParts, quiet_log
 
 from rse_pf.auth.roster import DenyList, Roster
 from rse_pf.auth.tokens import SigningKey
@@ -17,6 +15,8 @@ from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.handshake import Accepted, HandshakeRequest
 from rse_pf.server.log import JsonLog
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Result, Welcome
+from tests.kit.fakes import FakeWire
+from tests.kit.worker_parts import UNIX_S, WorkerParts, quiet_log
 
 SETTINGS = PlatformSettings()
 KEY = SigningKey.from_seed(b"k" * 32, "k1")

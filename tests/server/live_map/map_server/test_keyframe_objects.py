@@ -23,7 +23,7 @@ from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest
-from tests.server.live_map.map_server_bench import MAP, Bench, settle
+from tests.kit.map_server_setup import MAP, Bench, settle
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 ONE, OTHER = RobotId("default", "one"), RobotId("default", "other")

@@ -22,8 +22,8 @@ from rse_pf.server.live_map.map_server.log import LeaseLost, LiveLog, MapSnapsho
 from rse_pf.server.live_map.map_server.state import MapState, restore
 from rse_pf.storage.lease import Lease, read_record
 from rse_pf.storage.object_store import MemoryStore
-from tests.server.live_map.fake_map import FAKE_MAP, FakeMap
-from tests.server.live_map.map_server_bench import FOLDER, LEASE, HandClock
+from tests.kit.fake_map import FAKE_MAP, FakeMap
+from tests.kit.map_server_setup import FOLDER, LEASE, HandClock
 
 LEASE_S = 1.5
 

@@ -18,8 +18,8 @@ from rse_pf.server.live_map.map_server.environment import MapImplementation
 from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.server.live_map.map_server.map_server import MapMoving
 from rse_pf.storage.object_store import MemoryStore
-from tests.server.live_map.fake_map import FAKE_MAP, FakeMap
-from tests.server.live_map.map_server_bench import (
+from tests.kit.fake_map import FAKE_MAP, FakeMap
+from tests.kit.map_server_setup import (
     FOLDER,
     MAP,
     ROBOT,

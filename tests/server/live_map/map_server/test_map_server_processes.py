@@ -38,11 +38,11 @@ from rse_pf.server.live_map.process_pool import (
 from rse_pf.server.log import JsonLog
 from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.wire.live_map import LiveMapRequest, LiveRequest
-from tests.live_map.generated_drives import GeneratedWorld, circle
-from tests.server.live_map.fake_map import FAKE_MAP, keyframe_request
+from tests.kit.fake_map import FAKE_MAP, keyframe_request
+from tests.kit.generated_drives import GeneratedWorld, circle
 
 MAP, ROBOT = "warehouse", RobotId("default", "robot-1")
-KIND = "tests.server.live_map.fake_map:FAKE_MAP"
+KIND = "tests.kit.fake_map:FAKE_MAP"
 PATIENT_S = 30.0
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 import pytest
-from fakes import FakeLog
 
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, LoopClosuresMeasured
@@ -23,8 +22,9 @@ from rse_pf.server.live_map.map_server.measurement import (
 from rse_pf.server.live_map.map_server.state import MapState
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
-from tests.server.live_map.fake_map import FakeMap
-from tests.server.live_map.map_server_bench import settle
+from tests.kit.fake_map import FakeMap
+from tests.kit.fakes import FakeLog
+from tests.kit.map_server_setup import settle
 
 _T = TypeVar("_T")
 

@@ -9,7 +9,7 @@ import pytest
 from rse_pf.errors import Busy, NotFound, StoreError, StoreFull
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import MemoryStore
-from tests.server.live_map.map_server_bench import MAP, Bench, settle
+from tests.kit.map_server_setup import MAP, Bench, settle
 
 
 async def test_robots_that_leave_again_and_again_publish_one_version_in_an_interval_and_the_last_one_late():

@@ -11,7 +11,7 @@ from rse_pf.errors import Conflict, QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import MemoryStore, ObjectStore, charge_of
-from tests.server.live_map.map_server_bench import FOLDER, MAP, Bench, RunningMapServer, settle
+from tests.kit.map_server_setup import FOLDER, MAP, Bench, RunningMapServer, settle
 
 OTHER = RobotId("default", "robot-2", "thumb")
 QUOTA = 1_000_000

@@ -14,7 +14,7 @@ from rse_pf.geometry import Array, exp_se3
 from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.slam.keyframe import encode_keyframe
-from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle
+from tests.kit.generated_drives import GeneratedDrive, GeneratedWorld, circle
 
 HOSTILE = "x"
 _HONEST = ("a", "b", "c")

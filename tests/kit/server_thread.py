@@ -7,7 +7,7 @@ import contextlib
 import threading
 from collections.abc import Iterator
 
-from fakes import FakeServer
+from tests.kit.fakes import FakeServer
 
 
 class ServerThread:

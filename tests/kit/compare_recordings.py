@@ -11,7 +11,7 @@ from client_sdk.datasets import Dataset
 from client_sdk.frontend import Frame
 from client_sdk.trajectory import Trajectory
 from rse_pf.extensions.experiments.compare.recordings import Drive
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 
 __all__ = ["flat_drive"]
 

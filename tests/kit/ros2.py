@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from tests.ros_bridge.programs import Program, RosPrograms
+from tests.kit.ros_programs import Program, RosPrograms
 
 __all__ = ["COLOUR", "DOMAIN", "ROS2", "Ros2", "all_is_played"]
 

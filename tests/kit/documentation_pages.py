@@ -6,7 +6,7 @@ from pathlib import Path
 
 __all__ = ["PAGES", "ROOT"]
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 _GENERATED = ("docs/settings.md",)
 _REPORT = "report.md"
 """The name of the pages that experiments write."""

@@ -21,7 +21,7 @@ from rse_pf.services.custom.installed import install
 from rse_pf.services.pnp import make_request
 from rse_pf.storage.object_store import DirectoryStore, digest_of
 from rse_pf.wire import Command, Ping, Pong, Progress, Result
-from tests.hostile.attacks import AttackTarget, Socket
+from tests.kit.attacks import AttackTarget, Socket
 
 TENANTS = ("acme", "rival", "third")
 NAME = "robot-1"

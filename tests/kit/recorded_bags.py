@@ -13,7 +13,7 @@ from client_sdk.bags import BagKind, BagWriter
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TF
 from client_sdk.trajectory import read_trajectory
 from rse_pf.geometry import to_quaternion
-from tests.client_sdk.bags.small_bags import camera_info, compressed, raw_image, transforms
+from tests.kit.small_bags import camera_info, compressed, raw_image, transforms
 
 _START_NS = 1_700_000_000_000_000_000
 _FRAME = "camera_optical"

@@ -6,14 +6,13 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
-import server_sessions
-
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Conflict, RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.wire import Hello, make_codec
 from rse_pf.wire.server_session import ServerSession
+from tests.kit import server_sessions
 
 OnUpdate = Callable[[str, str, dict[str, Any]], None]
 

@@ -10,7 +10,7 @@ from rse_pf.live_map.events import KeyframeAdded
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, OptimiseWanted
 from rse_pf.slam.keyframe import decode_keyframe
-from tests.client_sdk.live.fake_live_map import FakeLiveRobot
+from tests.kit.fake_live_map import FakeLiveRobot
 
 __all__ = ["SharedMap"]
 

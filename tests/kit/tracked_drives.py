@@ -9,7 +9,7 @@ from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array
-from tests.client_sdk.live.fake_live_map import solved
+from tests.kit.fake_live_map import solved
 
 __all__ = ["NO_ANSWER", "Answer", "run", "run_all", "solve"]
 

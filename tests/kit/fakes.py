@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
 
-import server_sessions
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -32,6 +31,7 @@ from rse_pf.services import echo
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, codec_for, make_codec
 from rse_pf.wire.refusal import refusal_body
 from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
+from tests.kit import server_sessions
 
 
 class FakeTimer:

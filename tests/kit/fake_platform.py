@@ -11,7 +11,6 @@ import time
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
-import server_sessions
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -23,6 +22,7 @@ from rse_pf.services import echo
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, Update, codec_for, make_codec
 from rse_pf.wire.refusal import refusal_body
 from rse_pf.wire.server_session import BeginUpdates, Close, EndUpdates, Send, ServerSession, Submit
+from tests.kit import server_sessions
 
 __all__ = ["FakePlatform", "FakeSocket", "echo_services"]
 

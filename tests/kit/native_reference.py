@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, tr
 from rse_pf.pnp import PnpOptions, WeakLimits, engines, solve_pnp
 from rse_pf.pnp.native_solver import Evidence, native_solver
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
-from tests.two_views import add_depth_noise
+from tests.kit.two_views import add_depth_noise
 
 EVERY = pytest.mark.parametrize("engine", ["native", "opencv"])
 RIGHT_M, RIGHT_DEG = 0.1, 2.0

@@ -17,9 +17,9 @@ from client_sdk.rigs.rig_file import write_rig
 from client_sdk.simulator.drive import render_frames
 from client_sdk.simulator.world import DEPTH_M, ROOM_M, make_world
 from rse_pf.geometry import inverse
-from tests.client_sdk.bags.small_bags import camera_info, compressed, raw_image, stamp_of
-from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion, SimulatedImu
-from tests.ros_bridge.rendered_rig import RenderedRig, render_raw, rendered_rig
+from tests.kit.inertial_drive import InertialDrive, Motion, SimulatedImu
+from tests.kit.rendered_rig import RenderedRig, render_raw, rendered_rig
+from tests.kit.small_bags import camera_info, compressed, raw_image, stamp_of
 
 __all__ = ["ENCODINGS", "STEREO", "write_encodings", "write_stereo"]
 

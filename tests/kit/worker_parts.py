@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from fakes import FakeLoop, FakeWire
-
 from rse_pf.auth.tokens import Claims, KeySet
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
@@ -31,6 +29,7 @@ from rse_pf.service import Registry
 from rse_pf.services import echo
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import SUBPROTOCOLS, Codec, Hello, make_codec
+from tests.kit.fakes import FakeLoop, FakeWire
 
 BINARY = 2
 UNIX_S = 1_000_000.0

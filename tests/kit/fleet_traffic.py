@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from server.gateway.worker_parts import worker_parts
-
 from rse_pf.aws.fleet.metrics import datums, read_page
 from rse_pf.server.metrics import merge, render
 from rse_pf.wire import Command
+from tests.kit.worker_parts import worker_parts
 
 __all__ = ["Robot", "Traffic", "measure_traffic"]
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import msgspec
-from fakes import FakeLog
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, StoreError
@@ -24,7 +23,8 @@ from rse_pf.server.live_map.map_server.state import MapState, take_over
 from rse_pf.storage.lease import read_record
 from rse_pf.storage.object_store import MemoryStore, ObjectStore
 from rse_pf.storage.quotas import TenantAccount
-from tests.server.live_map.fake_map import FAKE_MAP
+from tests.kit.fake_map import FAKE_MAP
+from tests.kit.fakes import FakeLog
 
 __all__ = [
     "MAP",
@@ -154,7 +154,7 @@ class RunningMapServer:
     async def keyframe(
         self, number: int, features: bytes = b"good", robot: RobotId = ROBOT
     ) -> dict[str, Any]:
-        from tests.server.live_map.fake_map import keyframe_request
+        from tests.kit.fake_map import keyframe_request
 
         request = msgspec.msgpack.encode(keyframe_request(number, features))
         return await self.map_server.answer(robot, "live-keyframe", request)

@@ -15,7 +15,7 @@ from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, OptimiseWanted
 from rse_pf.slam.inertial import InertialMotion, KeyframeImu
 from rse_pf.slam.keyframe import SentKeyframe, UnknownBlock, decode_keyframe, encode_keyframe, make_features
-from tests.synthetic_maps import make_world
+from tests.kit.synthetic_maps import make_world
 
 HOSTILE = "x"
 _UNKNOWN_KIND, _IMU_KIND = 77, 6

@@ -6,8 +6,9 @@ import asyncio
 import json
 from typing import Any
 
-from guarded_server import GuardedServer
 from websockets.asyncio.client import ClientConnection, connect
+
+from tests.kit.guarded_server import GuardedServer
 
 PATIENCE_S = 30.0
 
