@@ -13,16 +13,17 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from client_sdk.check.drive_check import check_lines
 from client_sdk.source_facts import DoubtLog, check_accepted, ended_early, unresolved
 from rse_pf.command_line.extras import require
-from rse_pf.command_line.sensors import add_accept_argument, add_sensor_arguments, show_source
+from rse_pf.command_line.options import Action, option
+from rse_pf.command_line.sensors import AcceptRequest, SensorRequest, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.storage.files import read_document, replace_file
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from client_sdk.rigs.intrinsics import Intrinsics
     from client_sdk.rigs.stereo_pair_checks import PairFault
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _MOST_LIVE = 3000
 """A device is looked at for so many frames unless --frames says another number."""
@@ -45,74 +46,75 @@ _OF_RECORDINGS = ("rgb.txt", "intrinsics.json", "metadata.yaml")
 """Folders with one of these are recordings or bags, whatever report somebody left in them."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    add = parser.add_argument
-    add("source", metavar="SOURCE", help="a recording, bag, folder, video, device, or results of a map")
-    add("--intrinsics", type=Path, metavar="FILE", help="of the camera, instead of the file in the source")
-    add(
-        "--odometry", type=Path, metavar="FILE",
-        help="compare the motion with this path (TUM format; default: truth or odometry.txt of the source)",
-    )  # fmt: skip
-    add_sensor_arguments(parser)
-    add("--no-depth", action="store_true", help="use the colours only")
-    add("--frames", type=int, metavar="N", help="stop after so many frames")
-    add(
-        "--write",
-        type=Path,
-        metavar="FILE",
-        help="write intrinsics.json with the corrections that are certain",
+@dataclass(frozen=True, kw_only=True)
+class CheckDriveRequest(SensorRequest, AcceptRequest):
+    """A drive that is checked, and where the findings are written."""
+
+    source: str = option(
+        metavar="SOURCE", help="a recording, bag, folder, video, device, or results of a map"
     )
-    add("--out", type=Path, metavar="DIR", help="write report.json to this folder")
-    add("--json", action="store_true", help="print the report as JSON")
-    add_accept_argument(parser)
+    intrinsics: Path | None = option(
+        "--intrinsics", metavar="FILE", help="file of the camera, used instead of the one in the source"
+    )
+    odometry: Path | None = option(
+        "--odometry",
+        metavar="FILE",
+        help="compare the motion with this path (TUM format; default: truth or odometry.txt of the source)",
+    )
+    no_depth: bool = option("--no-depth", help="use the colour images only")
+    frames: int | None = option("--frames", metavar="N", help="stop after N frames")
+    write: Path | None = option(
+        "--write", metavar="FILE", help="write intrinsics.json with the corrections that are certain"
+    )
+    out: Path | None = option("--out", metavar="DIR", help="write report.json to this folder")
+    json: bool = option("--json", help="print the report as JSON")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def check_drive(request: CheckDriveRequest, settings: PlatformSettings) -> int:
     """Check one drive; the exit code is 1 if something is wrong with it."""
-    if args.frames is not None and args.frames < 2:
-        raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to look at all frames")
-    if args.write is not None and not args.write.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.write.absolute().parent}", hint="create it")
-    folder = Path(args.source)
+    if request.frames is not None and request.frames < 2:
+        raise UsageError(f"--frames {request.frames} is below 2", hint="leave it out to look at all frames")
+    if request.write is not None and not request.write.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {request.write.absolute().parent}", hint="create it")
+    folder = Path(request.source)
     results = folder / "report.json"
     if results.is_file() and not any((folder / name).exists() for name in _OF_RECORDINGS):
-        return _show_results(args, results)
+        return _show_results(request, results)
     require("check")
-    check_accepted(args.accept)
-    if args.out is not None:
+    check_accepted(request.accept)
+    if request.out is not None:
         try:
-            args.out.mkdir(parents=True, exist_ok=True)
+            request.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(
-                f"cannot make {args.out}: {error.strerror}", hint="name another --out"
+                f"cannot make {request.out}: {error.strerror}", hint="name another --out"
             ) from error
-    report, own, shown = _checked(args, settings)
+    report, own, shown = _checked(request, settings)
     told = report.to_dict()
-    if args.out is not None:
-        replace_file(args.out / "report.json", (json.dumps(told, indent=2) + "\n").encode())
-    written = [] if args.write is None else _write(args.write, report, own)
-    if args.json:
+    if request.out is not None:
+        replace_file(request.out / "report.json", (json.dumps(told, indent=2) + "\n").encode())
+    written = [] if request.write is None else _write(request.write, report, own)
+    if request.json:
         show_json(told, indent=2)
     else:
         show(*check_lines(told, is_whole=True, shown=shown), *written)
     return 1 if report.findings or report.doubts or report.poses == 0 else 0
 
 
-def _show_results(args: argparse.Namespace, file: Path) -> int:
+def _show_results(request: CheckDriveRequest, file: Path) -> int:
     """Show what was found while a map was made: its results have no images."""
     report = read_document(file, "a report of a map", hint="check the recording itself")
     told = report.get("check") if isinstance(report, dict) else None
     if not isinstance(told, dict):
         raise UsageError(
-            f"{args.source} was not checked while it was made, and its results have no images",
+            f"{request.source} was not checked while it was made, and its results have no images",
             hint="check the recording itself; only maps of cameras, recordings and bags are checked",
         )
     unused = ("write", "out", "odometry", "intrinsics", "frames")
-    given = next((name for name in unused if getattr(args, name) is not None), None)
+    given = next((name for name in unused if getattr(request, name) is not None), None)
     if given is not None:
         raise UsageError(f"results of a map are shown only: no --{given}", hint="check the recording itself")
-    if args.json:
+    if request.json:
         show_json(told, indent=2)
     else:
         show(*_lines_of_results(told, file))
@@ -127,7 +129,7 @@ def _lines_of_results(told: Mapping[str, Any], file: Path) -> list[str]:
 
 
 def _checked(
-    args: argparse.Namespace, settings: PlatformSettings
+    request: CheckDriveRequest, settings: PlatformSettings
 ) -> tuple[CheckReport, Intrinsics, tuple[str, ...]]:
     """Track the source, and return what is wrong with it, its intrinsics, and the lines that were shown."""
     from client_sdk.bags import is_bag
@@ -137,34 +139,45 @@ def _checked(
     from client_sdk.datasets import open_dataset
     from client_sdk.rigs.intrinsics import Intrinsics
 
-    path = Path(args.source)
+    path = Path(request.source)
     if not (path.exists() and (is_recording(path) or is_bag(path))):
-        reference = _reference(args, None)
+        reference = _reference(request, None)
         with open_camera(
-            args.source, intrinsics=args.intrinsics, depth=not args.no_depth, camera=args.camera, imu=args.imu
+            request.source,
+            intrinsics=request.intrinsics,
+            depth=not request.no_depth,
+            camera=request.camera,
+            imu=request.imu,
         ) as source:
-            most = args.frames or (_MOST_LIVE if str(args.source).isdigit() else None)
+            most = request.frames or (_MOST_LIVE if str(request.source).isdigit() else None)
             log = _compared(source.log, reference, source.span_s)
-            shown = show_source(source.notes, unresolved(log.doubts, args.accept))
+            shown = show_source(source.notes, unresolved(log.doubts, request.accept))
             report = _watched(
-                source, settings, reference, None, log, args.accept, has_depth=source.has_depth, most=most
+                source, settings, reference, None, log, request.accept, has_depth=source.has_depth, most=most
             )
-            return report, _base(args, Intrinsics(camera=source.camera)), shown
-    dataset = open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
+            return report, _base(request, Intrinsics(camera=source.camera)), shown
+    dataset = open_dataset(path, camera=request.camera, imu=request.imu, intrinsics=request.intrinsics)
     fault: PairFault | None = None
     if dataset.has_stereo:
         from client_sdk.rigs.stereo_pair_checks import find_fault_of_frames
 
         fault = find_fault_of_frames(dataset.sample_pairs())
     truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
-    reference = _reference(args, truth)
+    reference = _reference(request, truth)
     log = dataset.log if reference is truth else _compared(dataset.log, reference, dataset.span_s)
-    shown = show_source(dataset.notes, unresolved(log.doubts, args.accept))
-    has_depth = dataset.has_depth and not args.no_depth
+    shown = show_source(dataset.notes, unresolved(log.doubts, request.accept))
+    has_depth = dataset.has_depth and not request.no_depth
     report = _watched(
-        iter(dataset), settings, reference, fault, log, args.accept, has_depth=has_depth, most=args.frames
+        iter(dataset),
+        settings,
+        reference,
+        fault,
+        log,
+        request.accept,
+        has_depth=has_depth,
+        most=request.frames,
     )
-    return report, _base(args, Intrinsics(camera=dataset.camera)), shown
+    return report, _base(request, Intrinsics(camera=dataset.camera)), shown
 
 
 def _compared(
@@ -176,13 +189,13 @@ def _compared(
     return log
 
 
-def _reference(args: argparse.Namespace, truth: MotionReference | None) -> MotionReference | None:
+def _reference(request: CheckDriveRequest, truth: MotionReference | None) -> MotionReference | None:
     """Return what the user names, else the truth, else the odometry in the folder."""
     from client_sdk.check.motion import MotionReference
 
-    if args.odometry is not None:
-        return MotionReference.of_file(args.odometry)
-    return truth or MotionReference.beside(args.source)
+    if request.odometry is not None:
+        return MotionReference.of_file(request.odometry)
+    return truth or MotionReference.beside(request.source)
 
 
 def _watched(
@@ -237,13 +250,13 @@ def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:
         log.add(ended_early(error, count))
 
 
-def _base(args: argparse.Namespace, seen: Intrinsics) -> Intrinsics:
+def _base(request: CheckDriveRequest, seen: Intrinsics) -> Intrinsics:
     """Return the intrinsics that corrections apply to: those of the user or the folder, else *seen*."""
     from client_sdk.rigs.intrinsics import Intrinsics
     from client_sdk.rigs.rig_file import read_calibration
 
-    own = Path(args.source) / "intrinsics.json"
-    file = args.intrinsics or (own if own.is_file() else None)
+    own = Path(request.source) / "intrinsics.json"
+    file = request.intrinsics or (own if own.is_file() else None)
     known = None if file is None else read_calibration(file)
     return known if isinstance(known, Intrinsics) else seen
 
@@ -258,3 +271,6 @@ def _write(file: Path, report: CheckReport, own: Intrinsics) -> list[str]:
         return [f"{file} was not written: no finding changes intrinsics"]
     write_intrinsics(file, intrinsics)
     return [f"{file}: {', '.join(changes)}"]
+
+
+ACTION = Action(request=CheckDriveRequest, run=check_drive)

@@ -14,70 +14,80 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from client_sdk.source_facts import check_accepted
 from rse_pf.command_line.extras import require
-from rse_pf.command_line.sensors import add_accept_argument, add_sensor_arguments
+from rse_pf.command_line.options import Action, option
+from rse_pf.command_line.sensors import AcceptRequest, SensorRequest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _MAX_RUNS = 100
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "configs", nargs="*", default=["default"], metavar="CONFIG",
+@dataclass(frozen=True, kw_only=True)
+class CompareRequest(SensorRequest, AcceptRequest):
+    """Configurations and recordings that are compared."""
+
+    configs: tuple[str, ...] = option(
+        nargs="*",
+        default=("default",),
+        metavar="CONFIG",
         help="a name, NAME.toml, NAME.py or MODULE:FUNCTION (default: default)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--data", "--recording", nargs="+", required=True, metavar="RECORDING",
+    )
+    data: tuple[str, ...] = option(
+        "--data",
+        "--recording",
+        nargs="+",
+        required=True,
+        metavar="RECORDING",
         help="folders, ROS bags, or world:SEED",
-    )  # fmt: skip
-    parser.add_argument(
-        "--rate", nargs="+", type=float, default=[], metavar="HZ",
-        help="play so many frames per second, one after the other (default: all)",
-    )  # fmt: skip
-    add_sensor_arguments(parser)
-    add_accept_argument(parser)
-    parser.add_argument(
-        "--runs", type=int, default=1, metavar="N", help="run each so often, and show the spread (default: 1)"
     )
-    parser.add_argument(
-        "--out", type=Path, default=Path("out-compare"), metavar="DIR",
-        help="folder of results (default: out-compare)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--platform",
-        action="store_true",
-        help="solve the poses by a platform that is started on this machine",
+    rate: tuple[float, ...] = option(
+        "--rate",
+        nargs="+",
+        default=(),
+        metavar="HZ",
+        help="frames per second; several rates play each recording several times (default: all frames)",
+    )
+    runs: int = option(
+        "--runs", default=1, metavar="N", help="repeat each run N times, and show the spread (default: 1)"
+    )
+    out: Path = option(
+        "--out", default=Path("out-compare"), metavar="DIR", help="folder of results (default: out-compare)"
+    )
+    platform: bool = option(
+        "--platform", help="solve the poses by a platform that is started on this machine"
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def compare(request: CompareRequest, settings: PlatformSettings) -> int:
     """Check the options and run the comparison."""
-    if not 1 <= args.runs <= _MAX_RUNS:
-        raise UsageError(f"--runs {args.runs} is not within 1..{_MAX_RUNS}", hint="3 show a spread")
-    for rate_hz in args.rate:
+    if not 1 <= request.runs <= _MAX_RUNS:
+        raise UsageError(f"--runs {request.runs} is not within 1..{_MAX_RUNS}", hint="3 show a spread")
+    for rate_hz in request.rate:
         if not (math.isfinite(rate_hz) and 0.1 <= rate_hz <= 1000):
             raise UsageError(
                 f"--rate {rate_hz:g} is not within 0.1..1000 Hz", hint="leave it out to play all frames"
             )
-    check_accepted(args.accept)
+    check_accepted(request.accept)
     require("compare")
     from rse_pf.extensions.experiments.compare.configurations import configurations_of
     from rse_pf.extensions.experiments.compare.recordings import drives_of
     from rse_pf.extensions.experiments.compare.run import CompareOptions, run_compare
 
     options = CompareOptions(
-        configurations=configurations_of(args.configs),
-        drives=drives_of(args.data, args.rate, camera=args.camera, imu=args.imu),
-        runs=args.runs, out=args.out, platform=args.platform,
-        accepted=tuple(args.accept),
+        configurations=configurations_of(request.configs),
+        drives=drives_of(request.data, request.rate, camera=request.camera, imu=request.imu),
+        runs=request.runs, out=request.out, platform=request.platform,
+        accepted=request.accept,
     )  # fmt: skip
     return run_compare(options, settings)
+
+
+ACTION = Action(request=CompareRequest, run=compare)

@@ -19,16 +19,16 @@ import argparse
 import math
 import tempfile
 from collections.abc import Collection
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
-from rse_pf.command_line.sensors import add_sensor_arguments
+from rse_pf.command_line.options import Action, Parser, add_action, option, perform
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
 
-__all__ = ["KINDS", "add_arguments", "run"]
+__all__ = ["ACTION", "KINDS"]
 
 T = TypeVar("T")
 
@@ -37,112 +37,142 @@ _ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3, "live
 _MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32, "live": 32}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("kind", choices=KINDS, help="the experiment, or verify")
-    parser.add_argument(
-        "folder", nargs="?", type=Path, metavar="DIR", help="verify: results of one or more runs"
+@dataclass(frozen=True, kw_only=True)
+class ExperimentRequest:
+    """An experiment with its options, or the results of one that are verified."""
+
+    kind: str = option(choices=KINDS, help="the experiment, or verify")
+    folder: Path | None = option(nargs="?", metavar="DIR", help="verify: results of one or more runs")
+    out: Path | None = option("--out", metavar="DIR", help="folder of results (default: out-KIND)")
+    rerun: bool = option(
+        "--rerun",
+        help="verify: also run the short form that each report holds, and list the figures it does not reach",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of results (default: out-KIND)")
-    parser.add_argument(
-        "--rerun", action="store_true",
-        help="verify: also run the short form that each report holds, and name the figures it does not reach",
-    )  # fmt: skip
-    parser.add_argument("--robots", type=int, metavar="N", help="robots (default: 100; map and live: 3)")
-    parser.add_argument("--fps", type=float, default=5.0, help="frames per second of each robot (default: 5)")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="K", help="compress times (default: 1)")
-    parser.add_argument("--codec", choices=("zlib", "json", "bin"), default="zlib", help="default: zlib")
-    parser.add_argument("--seed", type=int, default=0, help="seed of problems, worlds and random faults")
-    elasticity = parser.add_argument_group("elasticity")
-    elasticity.add_argument(
-        "--emulated-cores", type=float, metavar="S", help="cores of a server (default: measured)"
+    robots: int | None = option("--robots", metavar="N", help="robots (default: 100; map and live: 3)")
+    fps: float = option("--fps", default=5.0, help="frames per second of each robot (default: 5)")
+    speed: float = option("--speed", default=1.0, metavar="K", help="divide times by K (default: 1)")
+    codec: str = option("--codec", choices=("zlib", "json", "bin"), default="zlib", help="default: zlib")
+    seed: int = option("--seed", default=0, help="seed of problems, worlds and random faults (default: 0)")
+    emulated_cores: float | None = option(
+        "--emulated-cores", section="elasticity", metavar="S", help="cores of a server (default: measured)"
     )
-    elasticity.add_argument(
-        "--no-rebalance", action="store_true", help="connected robots stay on their servers"
+    no_rebalance: bool = option(
+        "--no-rebalance", section="elasticity", help="connected robots stay on their servers"
     )
-    elasticity.add_argument("--compare", action="store_true", help="with and without rebalancing, in one run")
-    robustness = parser.add_argument_group("robustness and live")
-    robustness.add_argument(
-        "--only", metavar="A,B", help="these faults (default: all but random; of a live map: none)"
+    compare: bool = option("--compare", section="elasticity", help="with and without rebalancing, in one run")
+    only: str | None = option(
+        "--only",
+        section="robustness and live",
+        metavar="A,B",
+        help="these faults (default: all but random; of a live map: none)",
     )
-    robustness.add_argument(
-        "--repeat", type=int, default=1, metavar="N", help="runs of each fault (default: 1)"
+    repeat: int = option(
+        "--repeat",
+        default=1,
+        section="robustness and live",
+        metavar="N",
+        help="runs of each fault (default: 1)",
     )
-    latency = parser.add_argument_group("latency")
-    latency.add_argument("--link", default="paper", help="a link profile, or none (default: paper)")
-    latency.add_argument("--seconds", type=float, default=30.0, help="duration with all robots (default: 30)")
-    mapping = parser.add_argument_group("map and live")
-    mapping.add_argument("--data", type=Path, metavar="DIR", help="a recording (default: a rendered world)")
-    add_sensor_arguments(mapping)
-    mapping.add_argument(
-        "--frames", type=int, default=80, help="frames per robot, rendered world (default: 80)"
+    link: str = option(
+        "--link", default="paper", section="latency", help="a link profile, or none (default: paper)"
+    )
+    seconds: float = option(
+        "--seconds", default=30.0, section="latency", help="duration with all robots (default: 30)"
+    )
+    data: Path | None = option(
+        "--data",
+        section="map and live",
+        metavar="DIR",
+        help="a recording (default: a rendered world)",
+    )
+    camera: str | None = option(
+        "--camera",
+        choices=("stereo", "left"),
+        section="map and live",
+        help="both cameras of a stereo rig, or the left one alone (default: both where there are two)",
+    )
+    imu: bool | None = option(
+        "--imu",
+        action=argparse.BooleanOptionalAction,
+        section="map and live",
+        help="use the IMU, or do not (default: where there is one)",
+    )
+    frames: int = option(
+        "--frames",
+        default=80,
+        section="map and live",
+        help="frames per robot, rendered world (default: 80)",
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def run_experiment(request: ExperimentRequest, settings: PlatformSettings) -> int:
     """Check the options and run the experiment."""
-    if args.kind == "verify":
-        folder = args.folder if args.folder is not None else args.out
-        return max(_verify(folder), _rerun(folder, settings) if args.rerun else 0)
-    if args.rerun:
+    if request.kind == "verify":
+        folder = request.folder if request.folder is not None else request.out
+        if folder is None:
+            raise UsageError("verify needs a folder", hint="rse-pf experiment verify DIR")
+        return max(_verify(folder), _rerun(folder, settings) if request.rerun else 0)
+    if request.rerun:
         raise UsageError("--rerun is for verify", hint="rse-pf experiment verify DIR --rerun")
-    if args.folder is not None:
-        raise UsageError(f"{args.kind} takes no folder", hint=f"name the results with --out {args.folder}")
-    if args.out is None:
-        args.out = Path(f"out-{args.kind}")
-    if args.robots is None:
-        args.robots = _ROBOTS[args.kind]
-    _check(args)
+    if request.folder is not None:
+        raise UsageError(
+            f"{request.kind} takes no folder", hint=f"name the results with --out {request.folder}"
+        )
+    robots = _ROBOTS[request.kind] if request.robots is None else request.robots
+    request = replace(request, out=request.out or Path(f"out-{request.kind}"), robots=robots)
+    _check(request)
     return {
         "elasticity": _elasticity,
         "latency": _latency,
         "robustness": _robustness,
         "map": _map,
         "live": _live,
-    }[args.kind](args, settings)
+    }[request.kind](request, settings)
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check(request: ExperimentRequest) -> None:
     limits = (
-        ("--robots", args.robots, 1, _MAX_ROBOTS[args.kind], "the paper uses 100"),
-        ("--fps", args.fps, 0.1, 60, "the paper uses 5"),
-        ("--speed", args.speed, 1, 100, "1 takes as long as the paper; 30 suits CI"),
-        ("--seconds", args.seconds, 1, 3600, "30 is enough for percentiles"),
-        ("--emulated-cores", args.emulated_cores, 0.001, 64, "leave it out to measure it"),
-        ("--repeat", args.repeat, 1, 20, "3 shows the spread"),
-        ("--frames", args.frames, 2, 2000, "80 is a path of 5.5 m"),
+        ("--robots", request.robots, 1, _MAX_ROBOTS[request.kind], "the paper uses 100"),
+        ("--fps", request.fps, 0.1, 60, "the paper uses 5"),
+        ("--speed", request.speed, 1, 100, "1 takes as long as the paper; 30 suits CI"),
+        ("--seconds", request.seconds, 1, 3600, "30 is enough for percentiles"),
+        ("--emulated-cores", request.emulated_cores, 0.001, 64, "leave it out to measure it"),
+        ("--repeat", request.repeat, 1, 20, "3 shows the spread"),
+        ("--frames", request.frames, 2, 2000, "80 is a path of 5.5 m"),
     )
     for name, value, low, high, hint in limits:
         if value is not None and not (math.isfinite(value) and low <= value <= high):
             raise UsageError(f"{name} {value:g} is not within {low:g}..{high:g}", hint=hint)
-    if args.seed < 0:
-        raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
+    if request.seed < 0:
+        raise UsageError(f"--seed {request.seed} is below 0", hint="choose 0 or more")
 
 
-def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def _elasticity(request: ExperimentRequest, settings: PlatformSettings) -> int:
     from rse_pf.extensions.experiments.paper.elasticity import ElasticityOptions, run_elasticity
 
-    if settings.scaling.period_s / args.speed < 0.5:
+    if settings.scaling.period_s / request.speed < 0.5:
         raise UsageError(
-            f"--speed {args.speed:g} makes a period of the policy shorter than 0.5 s",
+            f"--speed {request.speed:g} makes a period of the policy shorter than 0.5 s",
             hint=f"use at most {2 * settings.scaling.period_s}",
         )
-    return run_elasticity(_options(ElasticityOptions, args, rebalance=not args.no_rebalance), settings)
+    return run_elasticity(_options(ElasticityOptions, request, rebalance=not request.no_rebalance), settings)
 
 
-def _latency(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def _latency(request: ExperimentRequest, settings: PlatformSettings) -> int:
     from rse_pf.extensions.experiments.paper.latency import LatencyOptions, run_latency
     from rse_pf.local.faults.network_emulator import profile_named
 
-    link = None if args.link == "none" else profile_named(args.link).name
-    return run_latency(_options(LatencyOptions, args, link=link), settings)
+    link = None if request.link == "none" else profile_named(request.link).name
+    return run_latency(_options(LatencyOptions, request, link=link), settings)
 
 
-def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def _robustness(request: ExperimentRequest, settings: PlatformSettings) -> int:
     from rse_pf.extensions.experiments.paper.fault_scenarios import SCENARIOS
     from rse_pf.extensions.experiments.paper.robustness import RobustnessOptions, run_robustness
 
-    return run_robustness(_options(RobustnessOptions, args, only=_faults(args.only, SCENARIOS)), settings)
+    return run_robustness(
+        _options(RobustnessOptions, request, only=_faults(request.only, SCENARIOS)), settings
+    )
 
 
 def _faults(only: str | None, known: Collection[str]) -> tuple[str, ...]:
@@ -154,35 +184,33 @@ def _faults(only: str | None, known: Collection[str]) -> tuple[str, ...]:
     return chosen
 
 
-def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def _map(request: ExperimentRequest, settings: PlatformSettings) -> int:
     from rse_pf.extensions.experiments.demo.run import DemoOptions
     from rse_pf.extensions.experiments.paper.mapping import run_map
 
-    return run_map(_options(DemoOptions, args, rate_hz=args.fps, quiet=True), settings)
+    return run_map(_options(DemoOptions, request, rate_hz=request.fps, quiet=True), settings)
 
 
-def _live(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def _live(request: ExperimentRequest, settings: PlatformSettings) -> int:
     from rse_pf.extensions.experiments.demo.run import DemoOptions
     from rse_pf.extensions.experiments.paper.live_faults import LIVE_FAULTS, run_live_faults
     from rse_pf.extensions.experiments.paper.live_map import run_live
 
-    options = _options(DemoOptions, args, rate_hz=args.fps, live=True, quiet=True)
-    only = _faults(args.only, LIVE_FAULTS)
-    return run_live_faults(options, settings, only, args.repeat) if only else run_live(options, settings)
+    options = _options(DemoOptions, request, rate_hz=request.fps, live=True, quiet=True)
+    only = _faults(request.only, LIVE_FAULTS)
+    return run_live_faults(options, settings, only, request.repeat) if only else run_live(options, settings)
 
 
-def _options(kind: type[T], args: argparse.Namespace, **changed: Any) -> T:
+def _options(kind: type[T], request: ExperimentRequest, **changed: Any) -> T:
     """Return the options of an experiment: its fields by their names on the command line."""
     known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    given = {name: value for name, value in vars(args).items() if name in known}
+    given = {name: value for name, value in vars(request).items() if name in known}
     return kind(**{**given, **changed})
 
 
-def _verify(folder: Path | None) -> int:
+def _verify(folder: Path) -> int:
     from rse_pf.extensions.experiments.paper.verify import verify
 
-    if folder is None:
-        raise UsageError("verify needs a folder", hint="rse-pf experiment verify DIR")
     checks = verify(folder)
     for check in checks:
         show(str(check))
@@ -208,7 +236,7 @@ def _rerun(folder: Path, settings: PlatformSettings) -> int:
         show(f"rse-pf experiment {' '.join(words)}")
         with tempfile.TemporaryDirectory(prefix="rse-pf-rerun-") as place:
             out = Path(place) / "short"
-            run(_Parser.parsed([*words, "--out", str(out)]), settings)
+            perform(_parse_short_form([*words, "--out", str(out)]), settings)
             figures = rerun_figures(report, read_report(out))
         for figure in figures:
             show(f"{part.name}: {figure}" if part != folder else str(figure))
@@ -217,14 +245,16 @@ def _rerun(folder: Path, settings: PlatformSettings) -> int:
     return int(missed > 0)
 
 
-class _Parser(argparse.ArgumentParser):
-    """The arguments in a report, which may be damaged."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(f"the short form in the report is damaged: {message}", hint="restore it")
-
-    @classmethod
-    def parsed(cls, words: list[str]) -> argparse.Namespace:
-        parser = cls(add_help=False)
-        add_arguments(parser)
+def _parse_short_form(words: list[str]) -> argparse.Namespace:
+    """Parse the arguments in a report, which may be damaged."""
+    parser = Parser(add_help=False)
+    add_action(parser, ACTION)
+    try:
         return parser.parse_args(words)
+    except UsageError as error:
+        raise UsageError(
+            f"the short form in the report is damaged: {error.message}", hint="restore the report"
+        ) from error
+
+
+ACTION = Action(request=ExperimentRequest, run=run_experiment)

@@ -1,4 +1,4 @@
-"""Find the store of the maps, and keep the map of a drive in it.
+"""Requests that name a store of maps, the search for it, and the map of a drive that is kept in it.
 
 Without a name the store is that of the settings, else that of the platform that runs on this machine, else
 the folder of ``rse-pf local``.
@@ -6,15 +6,16 @@ the folder of ``rse-pf local``.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
+from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, NotFound, RsePfError, UsageError
 from rse_pf.identity import RobotId
@@ -22,13 +23,91 @@ from rse_pf.local.processes import is_alive
 from rse_pf.local.state import platform_settings, read_state, state_folder
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.storage.quotas import TenantAccount
+from rse_pf.terminal import show, show_json
 
-__all__ = ["add_keep_arguments", "drive_store", "keep_map", "map_name", "open_maps", "with_store"]
+__all__ = [
+    "KeepRequest",
+    "MapRequest",
+    "StoreRequest",
+    "VersionRequest",
+    "drive_store",
+    "keep_map",
+    "map_name",
+    "open_maps",
+    "with_store",
+]
 
 _IN_MEMORY, _FOLDER = "memory:", "dir:"
 _OBJECTS = "objects"
 _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _NO_NAME = re.compile(r"[^a-z0-9]+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreRequest:
+    """Where maps are stored."""
+
+    store: str | None = option(
+        "--store",
+        help="store of the maps: dir:PATH or s3:BUCKET (default: data.store, or that of rse-pf local)",
+    )
+    platform: str | None = option(
+        "--name",
+        metavar="PLATFORM",
+        help="platform of this machine whose maps are used (default: the one that runs here)",
+    )
+    tenant: str = option(
+        "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
+    )
+    json: bool = option("--json", help="print JSON")
+
+    def settings_with_store(self, settings: PlatformSettings) -> PlatformSettings:
+        """Return the settings with the store of the request; raises UsageError."""
+        if self.store is not None and self.platform is not None:
+            raise UsageError("--store and --name name two stores", hint="leave one of them out")
+        return with_store(self.store, settings, self.platform)
+
+    def open_maps(self, settings: PlatformSettings) -> MapRegistry:
+        """Return the maps of the tenant in the store of the request; raises UsageError."""
+        return open_maps(self.settings_with_store(settings), self.tenant)
+
+    def print(self, value: Any, *lines: str) -> None:
+        """Print *value* with ``--json``, else *lines*."""
+        if self.json:
+            show_json(value, indent=2, sort_keys=True)
+        else:
+            show(*lines)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapRequest(StoreRequest):
+    """One map."""
+
+    name: str = option(metavar="MAP", help="name of the map")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VersionRequest(MapRequest):
+    """One version of a map."""
+
+    version: str = option(nargs="?", default="head", metavar="VERSION", help="default: %(default)s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeepRequest:
+    """Where the map of a drive is kept."""
+
+    objects: Path | None = option(
+        "--objects",
+        metavar="DIR",
+        help="folder of objects that keeps the map (default: that of data.store, or of rse-pf local)",
+    )
+    map: str | None = option(
+        "--map", metavar="NAME", help="name of the map that is kept (default: the name of --out)"
+    )
+    tenant: str = option(
+        "--tenant", default="default", help="tenant that owns the map (default: %(default)s)"
+    )
 
 
 def with_store(named: str | None, settings: PlatformSettings, name: str | None = None) -> PlatformSettings:
@@ -77,32 +156,22 @@ def open_maps(settings: PlatformSettings, tenant: str = "default") -> MapRegistr
     return MapRegistry(open_data_store(settings), tenant, max_bytes=max_bytes, on_change=record)
 
 
-def add_keep_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare where the map of a drive is kept."""
-    parser.add_argument(
-        "--objects", type=Path, metavar="DIR",
-        help="folder of objects that keeps the map (default: that of data.store, or of rse-pf local)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--map", metavar="NAME", help="name of the map that is kept (default: the name of --out)"
-    )
-    parser.add_argument("--tenant", default="default", help="tenant that owns the map (default: %(default)s)")
-
-
-def map_name(args: argparse.Namespace) -> str:
-    """Return the name of the map of a drive; raises UsageError."""
-    if args.map is None:
-        return _NO_NAME.sub("-", args.out.absolute().name.lower()).strip("-")[:64].strip("-") or "drive"
-    if not _MAP_NAME.fullmatch(args.map):
+def map_name(name: str | None, out: Path) -> str:
+    """Return the name of the map of a drive, by default that of its results; raises UsageError."""
+    if name is None:
+        return _NO_NAME.sub("-", out.absolute().name.lower()).strip("-")[:64].strip("-") or "drive"
+    if not _MAP_NAME.fullmatch(name):
         raise UsageError(
-            f"{args.map[:80]!r} is no name of a map", hint="use 1 to 64 small letters, digits and hyphens"
+            f"{name[:80]!r} is no name of a map", hint="use 1 to 64 small letters, digits and hyphens"
         )
-    return str(args.map)
+    return name
 
 
-def drive_store(args: argparse.Namespace, settings: PlatformSettings) -> PlatformSettings:
-    """Return the settings with the store that keeps the map of a drive; its folder is made if need be."""
-    folder: Path | None = args.objects
+def drive_store(folder: Path | None, settings: PlatformSettings) -> PlatformSettings:
+    """Return the settings with the store that keeps the map of a drive, *folder* if it is named.
+
+    A folder that does not exist is created.
+    """
     if folder is None and settings.data.store != _IN_MEMORY:
         return settings
     if folder is None:

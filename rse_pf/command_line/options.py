@@ -2,7 +2,7 @@
 
 An `Action` names the request of a verb, or of one action of it, and the function that takes the request::
 
-    @dataclass(frozen=True, slots=True, kw_only=True)
+    @dataclass(frozen=True, kw_only=True)
     class PruneRequest(MapRequest):
         keep: int = option("--keep", required=True, metavar="N", help="number of newest versions to keep")
 

@@ -4,41 +4,50 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from typing import Any
+from dataclasses import dataclass
+from typing import Literal
 
 from client_sdk.source_facts import Doubt
+from rse_pf.command_line.options import option
 from rse_pf.terminal import show
 
-__all__ = ["add_accept_argument", "add_check_argument", "add_sensor_arguments", "show_source"]
+__all__ = ["AcceptRequest", "CheckRequest", "SensorRequest", "show_source"]
 
 
-def add_sensor_arguments(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Declare the options; None means what the recording has."""
-    add: Any = parser.add_argument
-    add(
-        "--camera", choices=("stereo", "left"),
-        help="both cameras of a rig, or the left one alone (default: both where there are two)",
-    )  # fmt: skip
-    add(
-        "--imu", action=argparse.BooleanOptionalAction, default=None,
-        help="use the IMU, or do not (default: where there is one)",
-    )  # fmt: skip
+@dataclass(frozen=True, kw_only=True)
+class SensorRequest:
+    """Which sensors of a recording are used; None means those that it has."""
 
-
-def add_check_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--no-check``."""
-    parser.add_argument(
-        "--no-check", dest="check", action="store_false", help="do not check calibration, times and images"
+    camera: Literal["stereo", "left"] | None = option(
+        "--camera",
+        choices=("stereo", "left"),
+        help="both cameras of a stereo rig, or the left one alone (default: both where there are two)",
     )
-    add_accept_argument(parser)
+    imu: bool | None = option(
+        "--imu",
+        action=argparse.BooleanOptionalAction,
+        help="use the IMU, or do not (default: where there is one)",
+    )
 
 
-def add_accept_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--accept``."""
-    parser.add_argument(
-        "--accept", action="append", default=[], metavar="NAME",
-        help="take a finding about the source for right: NAME stands before it, such as left-out",
-    )  # fmt: skip
+@dataclass(frozen=True, kw_only=True)
+class AcceptRequest:
+    """Which findings about the source of a drive are accepted."""
+
+    accept: tuple[str, ...] = option(
+        "--accept",
+        action="append",
+        default=(),
+        metavar="NAME",
+        help="accept a finding about the source: NAME stands before it, such as left-out; repeatable",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRequest(AcceptRequest):
+    """Whether a drive is checked while it is tracked."""
+
+    check: bool = option("--no-check", default=True, help="do not check calibration, times and images")
 
 
 def show_source(notes: Iterable[str], doubts: Iterable[Doubt]) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
@@ -12,8 +11,7 @@ from client_sdk.check.corrections import corrected
 from client_sdk.check.drive_check import DriveCheck, check_lines
 from client_sdk.check.findings import FaultKind, Finding
 from client_sdk.rigs.intrinsics import Intrinsics
-from rse_pf.cli.main import main
-from rse_pf.command_line.sensors import add_check_argument
+from rse_pf.cli.main import main, parser_of
 from rse_pf.geometry import Camera
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
@@ -68,9 +66,8 @@ def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.
 
 
 def test_no_check_leaves_it_out() -> None:
-    parser = argparse.ArgumentParser()
-    add_check_argument(parser)
-    check = DriveCheck(is_wanted=parser.parse_args(["--no-check"]).check)
+    parsed = parser_of("map").parse_args(["from-camera", "0", "--no-check"])
+    check = DriveCheck(is_wanted=parsed.check)
 
     assert check.finish() is None
     assert check.lines(None) == []

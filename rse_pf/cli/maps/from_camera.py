@@ -6,23 +6,24 @@ is pressed, and writes map, trajectory, report and picture.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import json
 import signal
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 from urllib.parse import urlsplit
 
 from client_sdk.check.drive_check import DriveCheck
 from client_sdk.source_facts import check_accepted, ended_early, unresolved
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.cli.maps.keyframe_images import KeyframeImages
-from rse_pf.command_line.map_store import add_keep_arguments, drive_store, keep_map, map_name
-from rse_pf.command_line.sensors import add_check_argument, add_sensor_arguments, show_source
+from rse_pf.command_line.map_store import KeepRequest, drive_store, keep_map, map_name
+from rse_pf.command_line.options import option
+from rse_pf.command_line.sensors import CheckRequest, SensorRequest, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.identity import DEFAULT_TENANT
@@ -40,10 +41,7 @@ if TYPE_CHECKING:
     from client_sdk.trajectory import Trajectory
     from rse_pf.geometry import Array
 
-__all__ = [
-    "add_drive_arguments", "add_from_camera_arguments", "check_drive", "errors_of", "map_source",
-    "run_from_camera",
-]  # fmt: skip
+__all__ = ["DriveRequest", "FromCameraRequest", "check_drive", "errors_of", "map_source", "run_from_camera"]
 
 _ROBOT = "camera"
 _MOST = 0.5
@@ -52,72 +50,83 @@ _LINE_EVERY_S = 5.0
 """Time between two lines of progress in a file or pipe."""
 
 
-def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``map from-camera``."""
-    add = parser.add_argument
-    add(
-        "source",
-        metavar="SOURCE",
-        help="a device (0), two (0,2), a video, a folder, a recording or realsense",
-    )
-    add_sensor_arguments(parser)
-    add_drive_arguments(parser, Path("out-camera"))
+@dataclass(frozen=True, kw_only=True)
+class DriveRequest(CheckRequest, KeepRequest):
+    """Frames of any source from which a map is made, and what becomes of the map."""
 
+    author: ClassVar[str]
+    """Who made the map, as its versions name it."""
 
-def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
-    """Declare what all sources of frames share; *out* is the default folder of results."""
-    add = parser.add_argument
-    add(
+    source: str
+    out: Path
+    intrinsics: Path | None = option(
         "--intrinsics",
-        type=Path,
         metavar="FILE",
-        help="of the camera, or rig.json: see rse-pf camera calibrate",
+        help="file of the camera, or rig.json of a rig: see rse-pf camera calibrate",
     )
-    add(
+    scale: str | None = option(
         "--scale",
         metavar="SOURCE",
         help="without depth: marker:MM (edge of an ArUco 4x4_50 marker) or odometry:FILE (TUM format)",
     )
-    add(
-        "--features", metavar="MODULE:FUNCTION",
+    features: str | None = option(
+        "--features",
+        metavar="MODULE:FUNCTION",
         help="find features with this function instead of ORB: see docs/own_parts.md",
-    )  # fmt: skip
-    add("--no-depth", action="store_true", help="use the colours only")
-    add("--rate", type=float, metavar="HZ", help="play so many frames per second (default: all)")
-    add("--frames", type=int, metavar="N", help="stop after so many frames")
-    add_check_argument(parser)
-    add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
-    add_keep_arguments(parser)
-    add(
-        "--keep-images", action="store_true",
-        help="write the images of keyframes into DIR/images, for map export --images",
-    )  # fmt: skip
-    add(
-        "--url", action="append",
+    )
+    no_depth: bool = option("--no-depth", help="use the colour images only")
+    rate: float | None = option(
+        "--rate", metavar="HZ", help="play this number of frames per second (default: all)"
+    )
+    frames: int | None = option("--frames", metavar="N", help="stop after N frames")
+    keep_images: bool = option(
+        "--keep-images", help="write the images of keyframes into DIR/images, for map export --images"
+    )
+    url: tuple[str, ...] = option(
+        "--url",
+        action="append",
+        default=(),
         help="use the platform at this address, with --token-file; with several, the nearest of them",
-    )  # fmt: skip
-    add("--token-file", type=Path, metavar="FILE", help="with --url: file that holds the robot's token")
-    add("--enrolment", type=Path, metavar="FILE", help="use the platform of rse-pf robot enrol --out FILE")
+    )
+    token_file: Path | None = option(
+        "--token-file", metavar="FILE", help="with --url: file that holds the robot's token"
+    )
+    enrolment: Path | None = option(
+        "--enrolment", metavar="FILE", help="use the platform of rse-pf robot enrol --out FILE"
+    )
 
 
-def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int:
+@dataclass(frozen=True, kw_only=True)
+class FromCameraRequest(SensorRequest, DriveRequest):
+    """A camera, a video or images from which a map is made."""
+
+    author = "rse-pf map from-camera"
+    source: str = option(
+        metavar="SOURCE", help="a device (0), two (0,2), a video, a folder, a recording or realsense"
+    )
+    out: Path = option(
+        "--out", default=Path("out-camera"), metavar="DIR", help="results (default: %(default)s)"
+    )
+
+
+def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> int:
     """Track the camera and write the results; the exit code is 1 if most frames have no pose."""
-    scale = check_drive(args)
+    scale = check_drive(request)
     from client_sdk.cameras import open_camera
     from client_sdk.check.motion import MotionReference, read_odometry
 
-    recording = _recording(args)
+    recording = _recording(request)
     reference = None
-    kind, _, scale_file = (args.scale or "").partition(":")
+    kind, _, scale_file = (request.scale or "").partition(":")
     odometries = [Path(scale_file)] if kind == "odometry" else []
-    if args.check:
+    if request.check:
         try:
-            reference = MotionReference.beside(args.source)
+            reference = MotionReference.beside(request.source)
             if reference is not None:
-                odometries.append(Path(args.source) / "odometry.txt")
+                odometries.append(Path(request.source) / "odometry.txt")
         except UsageError as error:
             show(f"note: {error}: it is not compared with the motion", error=True)
-    if recording is not None and args.check:
+    if recording is not None and request.check:
         truth = MotionReference.of_truth(recording.truth, recording.truth_kind)
         reference = truth or reference
 
@@ -127,27 +136,27 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
         return errors_of(path, recording.truth, recording.truth_kind, recording.T_body_camera)
 
     with open_camera(
-        args.source,
-        intrinsics=args.intrinsics,
-        rate_hz=args.rate,
-        depth=not args.no_depth,
-        camera=args.camera,
-        imu=args.imu,
+        request.source,
+        intrinsics=request.intrinsics,
+        rate_hz=request.rate,
+        depth=not request.no_depth,
+        camera=request.camera,
+        imu=request.imu,
     ) as source:
         for file in odometries:
             source.log.add_reference(str(file), read_odometry(file).timestamps_s, source.span_s)
-        return map_source(args, settings, source, scale, about, reference)
+        return map_source(request, settings, source, scale, about, reference)
 
 
-def _recording(args: argparse.Namespace) -> Dataset | None:
+def _recording(request: FromCameraRequest) -> Dataset | None:
     """Return the recording that the source is, for its true poses; None if it is a camera or a video."""
     from client_sdk.cameras.open_camera import is_recording
     from client_sdk.datasets import open_dataset
 
-    path = Path(args.source)
+    path = Path(request.source)
     if not is_recording(path):
         return None
-    return open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
+    return open_dataset(path, camera=request.camera, imu=request.imu, intrinsics=request.intrinsics)
 
 
 def errors_of(
@@ -160,7 +169,7 @@ def errors_of(
 
 
 def map_source(
-    args: argparse.Namespace,
+    request: DriveRequest,
     settings: PlatformSettings,
     source: FrameSource,
     scale: OdometryScale | MarkerScale | None,
@@ -174,48 +183,52 @@ def map_source(
     if scale is not None and (source.has_depth or source.has_stereo):
         what, option = ("depth", "--no-depth") if source.has_depth else ("a pair of cameras", "--camera left")
         raise UsageError(
-            f"{args.source} has {what}, so that its scale is known",
+            f"{request.source} has {what}, so that its scale is known",
             hint=f"leave out --scale, or add {option}",
         )
     from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
     from rse_pf.extensions.experiments.results.markdown import lost_line
 
-    _make_folder(args.out)
-    kept_in = drive_store(args, settings)
+    _make_folder(request.out)
+    kept_in = drive_store(request.objects, settings)
     frames = FrameTable()
-    images = KeyframeImages(args.out) if args.keep_images else None
-    check = DriveCheck(is_wanted=args.check, is_thinned=args.rate is not None)
+    images = KeyframeImages(request.out) if request.keep_images else None
+    check = DriveCheck(is_wanted=request.check, is_thinned=request.rate is not None)
 
     def watch(frame: Frame, tracked: TrackedFrame) -> None:
         check.add(frame, tracked)
         if images is not None:
             images.add(tracked)
 
-    check_accepted(args.accept)
-    shown = show_source(source.notes, unresolved(source.log.doubts, args.accept))
-    mapper, failed = asyncio.run(_drive(args, settings, source, scale, frames, watch))
+    check_accepted(request.accept)
+    shown = show_source(source.notes, unresolved(source.log.doubts, request.accept))
+    mapper, failed = asyncio.run(_drive(request, settings, source, scale, frames, watch))
     if failed is not None:
         source.log.add(ended_early(failed, mapper.frames))
-    doubts = unresolved(source.log.doubts, args.accept)
-    report = {**mapper.save(args.out), "assumed": list(source.notes)}
-    checked = check.finish(reference, mapper.adjust_pairs() if check.is_wanted else None, doubts, args.accept)
+    doubts = unresolved(source.log.doubts, request.accept)
+    report = {**mapper.save(request.out), "assumed": list(source.notes)}
+    checked = check.finish(
+        reference, mapper.adjust_pairs() if check.is_wanted else None, doubts, request.accept
+    )
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if report["unit"] != "m" and report.get("ate_cm") is not None:
         report |= dict.fromkeys(("path_m", "ate_cm", "rpe_cm"))  # a path without scale has no centimetres
     if checked is not None:
         report["check"] = checked
-    kept, kept_line = _keep(args, mapper, kept_in, images)
+    kept, kept_line = _keep(request, mapper, kept_in, images)
     report = {**report, **kept}
-    replace_file(args.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
-    frames.write(args.out / FRAMES_FILE)
+    replace_file(request.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
+    frames.write(request.out / FRAMES_FILE)
     points, colours = mapper.map.points()
     path = mapper.trajectory
     unit = "m" if report["unit"] == "m" else "units"
     if len(path) and len(points):
-        caption = f"{args.source}: {report['frames']} frames, {report['map_points']:,} points, {mapper.scale}"
+        caption = (
+            f"{request.source}: {report['frames']} frames, {report['map_points']:,} points, {mapper.scale}"
+        )
         drawn = RobotPath(name=_ROBOT, T_world_camera=path.T_world_camera)
-        draw_map(args.out / "map.png", points, colours, [drawn], caption, unit=unit)
+        draw_map(request.out / "map.png", points, colours, [drawn], caption, unit=unit)
     posed = len(path)
     trip = report["round_trip_ms"]["p50"]
     show(
@@ -226,9 +239,9 @@ def map_source(
         *accuracy_lines(report),
         *frames.lines(),
         *([f"the IMU is {report['imu']}"] if str(report.get("imu") or "").startswith("not") else []),
-        *([] if args.check else [line for doubt in doubts if (line := doubt.line()) not in shown]),
+        *([] if request.check else [line for doubt in doubts if (line := doubt.line()) not in shown]),
         *check.lines(checked, shown),
-        f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
+        f"results: {request.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
         kept_line,
     )
     if failed is not None:
@@ -265,45 +278,46 @@ def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def _keep(
-    args: argparse.Namespace, mapper: Mapper, settings: PlatformSettings, images: KeyframeImages | None
+    request: DriveRequest, mapper: Mapper, settings: PlatformSettings, images: KeyframeImages | None
 ) -> tuple[dict[str, Any], str]:
     """Keep the map, so that others can be found in it; return the fields of the report, and a line."""
     data, kept = None, {}
     try:
         data = mapper.encoded_map()
-        author = f"rse-pf map {args.action}"
-        kept = keep_map(data, map_name(args), settings, tenant=args.tenant, author=author)
+        kept = keep_map(
+            data, map_name(request.map, request.out), settings, tenant=request.tenant, author=request.author
+        )
     except RsePfError as error:
         why = "its scale is not known" if isinstance(error, UsageError) else f"{error.code}: {error.message}"
         if mapper.keyframes == 0:
             why = "it has no keyframe"
         kept, line = {"map": None, "map_reason": why}, f"no map is kept: {why}"
     else:
-        tenant = "" if args.tenant == DEFAULT_TENANT else f" --tenant {args.tenant}"
+        tenant = "" if request.tenant == DEFAULT_TENANT else f" --tenant {request.tenant}"
         line = f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}{tenant}"
     if images is not None:
         count = images.finish(None if data is None else decode_map(data))
         kept["images"] = count
-        line += f"; {count} images in {args.out / IMAGES_FOLDER}"
+        line += f"; {count} images in {request.out / IMAGES_FOLDER}"
     return kept, line
 
 
-def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
+def check_drive(request: DriveRequest) -> OdometryScale | MarkerScale | None:
     """Refuse options that contradict each other, and return the scale; raises UsageError."""
     from client_sdk.plugins import load_features
 
-    load_features(args.features)
-    map_name(args)
-    if args.frames is not None and args.frames < 2:
-        raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to use all frames")
-    if args.enrolment is not None and (args.url is not None or args.token_file is not None):
+    load_features(request.features)
+    map_name(request.map, request.out)
+    if request.frames is not None and request.frames < 2:
+        raise UsageError(f"--frames {request.frames} is below 2", hint="leave it out to use all frames")
+    if request.enrolment is not None and (request.url or request.token_file is not None):
         raise UsageError("--enrolment names address and key", hint="leave out --url and --token-file")
-    if (args.url is None) != (args.token_file is None):
+    if bool(request.url) != (request.token_file is not None):
         raise UsageError("--url and --token-file need each other", hint="get a token: rse-pf token")
-    for url in args.url or []:
+    for url in request.url:
         if urlsplit(url).scheme not in ("ws", "wss"):
             raise UsageError(f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
-    return _scale(args.scale)
+    return _scale(request.scale)
 
 
 def _scale(word: str | None) -> OdometryScale | MarkerScale | None:
@@ -331,7 +345,7 @@ def _make_folder(folder: Path) -> None:
 
 
 async def _drive(
-    args: argparse.Namespace,
+    request: DriveRequest,
     settings: PlatformSettings,
     source: FrameSource,
     scale: Any,
@@ -347,12 +361,12 @@ async def _drive(
     stop = asyncio.Event()
     with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # not in the main thread
         asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
-    async with _robot(args, settings) as robot:
-        mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(args.features),
+    async with _robot(request, settings) as robot:
+        mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(request.features),
                               keyframes_of=_ROBOT)  # fmt: skip
         status = _Status(time.monotonic)
         failed: RsePfError | None = None
-        while not stop.is_set() and (args.frames is None or mapper.frames < args.frames):
+        while not stop.is_set() and (request.frames is None or mapper.frames < request.frames):
             try:
                 frame = await asyncio.to_thread(next, source, None)
             except RsePfError as error:
@@ -368,30 +382,30 @@ async def _drive(
             status.show(mapper, tracked)
         status.end()
     if not mapper.frames:
-        raise UsageError(f"{args.source} gives no frame", hint="look at it: rse-pf camera check")
+        raise UsageError(f"{request.source} gives no frame", hint="look at it: rse-pf camera check")
     return mapper, failed
 
 
 @contextlib.asynccontextmanager
-async def _robot(args: argparse.Namespace, settings: PlatformSettings) -> AsyncIterator[Robot]:
+async def _robot(request: DriveRequest, settings: PlatformSettings) -> AsyncIterator[Robot]:
     """Connect to the named platform, or to one that is started for the drive."""
     from client_sdk import connect
 
-    if args.enrolment is not None:
-        async with connect(enrolment=args.enrolment, settings=settings.session) as robot:
+    if request.enrolment is not None:
+        async with connect(enrolment=request.enrolment, settings=settings.session) as robot:
             yield robot
-    elif args.url is not None:
+    elif request.token_file is not None:
         try:
-            token = args.token_file.read_text(encoding="ascii").strip()
+            token = request.token_file.read_text(encoding="ascii").strip()
         except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"cannot read the token in {args.token_file}", hint="rse-pf token") from error
-        async with connect(args.url, token=token, settings=settings.session) as robot:
+            raise UsageError(f"cannot read the token in {request.token_file}", hint="rse-pf token") from error
+        async with connect(list(request.url), token=token, settings=settings.session) as robot:
             yield robot
     else:
         from rse_pf.extensions.experiments.results.result_folder import remove_keys
         from rse_pf.local.control.platform import LocalPlatform
 
-        folder = args.out / "platform"
+        folder = request.out / "platform"
         show("starting the platform: Envoy and backend servers")
         try:
             async with LocalPlatform(settings, port=0, state=folder, name="from-camera") as platform:

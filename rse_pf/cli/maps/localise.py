@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import ssl
 from collections.abc import Iterator
@@ -13,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from rse_pf.command_line.map_store import MapRequest
+from rse_pf.command_line.options import option
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.descriptors import check_same_kind
@@ -28,114 +30,119 @@ if TYPE_CHECKING:
     from client_sdk.transfer.data_client import DataClient
     from rse_pf.slam.relative_pose import View
 
-__all__ = ["add_localise_arguments", "is_remote", "localise_frames", "localise_photos"]
+__all__ = ["LocaliseRequest", "run_localise"]
 
 _FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
 _MAX_PHOTO_BYTES = 1 << 26
 """The platform says what it takes; this only keeps a wrong file out of memory."""
 
 
-def add_localise_arguments(localise: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    localise.add_argument(
-        "frames",
+@dataclass(frozen=True, kw_only=True)
+class LocaliseRequest(MapRequest):
+    """Frames whose poses in a map are estimated, in this process or by a platform."""
+
+    frames: tuple[str, ...] = option(
         nargs="+",
         metavar="FRAME",
         help="an image, a folder of images, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
     )
-    localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th frame")
-    localise.add_argument(
+    every: int = option("--every", default=1, metavar="N", help="only every n-th frame")
+    camera: str | None = option(
         "--camera",
         metavar="FX,FY,CX,CY",
         help="camera of images, pixels (default: the camera of the map with the same image size)",
     )
-    localise.add_argument(
-        "--features", metavar="MODULE:FUNCTION", help="with which the map was made (default: ORB)"
+    features: str | None = option(
+        "--features",
+        metavar="MODULE:FUNCTION",
+        help="function that finds features, the one with which the map was made (default: ORB)",
     )
-    localise.add_argument(
+    url: str | None = option(
         "--url", help="localise at the platform of this address, http(s): or ws(s):, with --token-file"
     )
-    localise.add_argument(
-        "--token-file", type=Path, metavar="FILE", help="with --url: file that holds the token"
+    token_file: Path | None = option(
+        "--token-file", metavar="FILE", help="with --url: file that holds the token"
     )
-    localise.add_argument(
-        "--authority", type=Path, metavar="FILE", help="with --url: certificate to trust, authority.crt"
+    authority: Path | None = option(
+        "--authority", metavar="FILE", help="with --url: certificate to trust, authority.crt"
     )
-    localise.add_argument(
-        "--enrolment", type=Path, metavar="FILE", help="localise at the platform of this enrolment"
+    enrolment: Path | None = option(
+        "--enrolment", metavar="FILE", help="localise at the platform of this enrolment"
     )
-    localise.add_argument(
-        "--intrinsics", type=Path, metavar="FILE", help="at a platform: of the camera, with its distortion"
+    intrinsics: Path | None = option(
+        "--intrinsics", metavar="FILE", help="with --url or --enrolment: file of the camera, with distortion"
     )
 
 
-def is_remote(args: argparse.Namespace) -> bool:
-    """Return whether a platform localises, and not this process."""
-    return args.url is not None or args.enrolment is not None
+def run_localise(request: LocaliseRequest, settings: PlatformSettings) -> int:
+    """Estimate the poses at the platform that is named, else here; the exit code is 1 if none is found."""
+    if request.url is not None or request.enrolment is not None:
+        return _localise_photos(request)
+    return _localise_frames(request, request.open_maps(settings))
 
 
-def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
+def _localise_frames(request: LocaliseRequest, maps: MapRegistry) -> int:
     """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
     from rse_pf.services.mapping.localise import locate
     from rse_pf.services.mapping.photo import location_of
     from rse_pf.services.mapping.place import open_map
 
-    if args.intrinsics is not None or args.token_file is not None or args.authority is not None:
+    if request.intrinsics is not None or request.token_file is not None or request.authority is not None:
         raise UsageError(
             "--intrinsics, --token-file and --authority are for a platform", hint="add --url, or use --camera"
         )
-    if args.every < 1:
-        raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
+    if request.every < 1:
+        raise UsageError(f"--every {request.every} is below 1", hint="1 takes every frame")
     from client_sdk.plugins import FeaturesPlugin, load_features
 
-    features = load_features(args.features)
+    features = load_features(request.features)
     plugin = None if features is None else FeaturesPlugin(features)
-    name, _, version = args.name.partition("@")
+    name, _, version = request.name.partition("@")
     data = maps.data(name, version or "head")
-    with at_work(f"reading {args.name}"):
+    with at_work(f"reading {request.name}"):
         version_map, index = open_map(data)
-    frames = [each for word in args.frames for each in _frames(word, args.every)]
+    frames = [each for word in request.frames for each in _frames(word, request.every)]
     found: list[dict[str, Any]] = []
     for each in frames:
-        reply = locate(index, _view_of(each, version_map, args.camera, plugin))
+        reply = locate(index, _view_of(each, version_map, request.camera, plugin))
         found.append(_location_document(each.label, location_of(reply, version or "head")))
-        if not args.json:
+        if not request.json:
             show(_location_line(found[-1]))
-    return _finish(args, found)
+    return _finish(request, found)
 
 
-def localise_photos(args: argparse.Namespace) -> int:
+def _localise_photos(request: LocaliseRequest) -> int:
     """Let a platform localise each photo and print a line for it; the exit code is 1 if none is found."""
-    if args.store is not None or args.features is not None or args.every != 1:
+    if request.store is not None or request.features is not None or request.every != 1:
         raise UsageError(
             "--store, --features and --every are for a map of a store", hint="leave them out, or leave --url"
         )
-    lens = _lens_of(args)
-    photos = [(str(path), _photo(path)) for word in args.frames for path in _photo_files(Path(word))]
-    client = _client(args)
+    lens = _lens_of(request)
+    photos = [(str(path), _photo(path)) for word in request.frames for path in _photo_files(Path(word))]
+    client = _client(request)
     found: list[dict[str, Any]] = []
     try:
         for label, photo in photos:
-            found.append(_location_document(label, client.localise(args.name, photo, lens)))
-            if not args.json:
+            found.append(_location_document(label, client.localise(request.name, photo, lens)))
+            if not request.json:
                 show(_location_line(found[-1]))
     finally:
         client.close()
-    return _finish(args, found)
+    return _finish(request, found)
 
 
-def _lens_of(args: argparse.Namespace) -> PhotoLens:
-    if (args.intrinsics is None) == (args.camera is None):
+def _lens_of(request: LocaliseRequest) -> PhotoLens:
+    if request.camera is not None and request.intrinsics is None:
+        fx, fy, cx, cy = _four_numbers(request.camera)
+        return PhotoLens(fx=fx, fy=fy, cx=cx, cy=cy)
+    if request.intrinsics is None or request.camera is not None:
         raise UsageError(
             "a platform needs --intrinsics FILE, or --camera FX,FY,CX,CY, and not both",
             hint="make a file: rse-pf camera calibrate SOURCE, without or with a board (docs/cameras.md)",
         )
-    if args.camera is not None:
-        fx, fy, cx, cy = _four_numbers(args.camera)
-        return PhotoLens(fx=fx, fy=fy, cx=cx, cy=cy)
     from client_sdk.rigs.rig_file import read_intrinsics
 
-    read = read_intrinsics(args.intrinsics)
+    read = read_intrinsics(request.intrinsics)
     camera = read.camera
     return PhotoLens(
         fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=camera.width, height=camera.height,
@@ -163,31 +170,31 @@ def _photo(path: Path) -> bytes:
         raise UsageError(f"{path} is no photo", hint="name a JPEG or PNG file") from error
 
 
-def _client(args: argparse.Namespace) -> DataClient:
+def _client(request: LocaliseRequest) -> DataClient:
     from client_sdk.transfer.data_client import DataClient, DataOptions
 
-    if args.enrolment is not None:
-        if args.url is not None or args.token_file is not None or args.authority is not None:
+    if request.enrolment is not None:
+        if request.url is not None or request.token_file is not None or request.authority is not None:
             raise UsageError("--enrolment names address and key", hint="leave out --url and its options")
-        return DataClient.enrolled(args.enrolment)
-    if args.token_file is None:
+        return DataClient.enrolled(request.enrolment)
+    if request.url is None or request.token_file is None:
         raise UsageError("--url needs --token-file", hint="get a token: rse-pf token issue NAME > FILE")
     try:
-        token = args.token_file.read_text(encoding="ascii").strip()
+        token = request.token_file.read_text(encoding="ascii").strip()
     except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read the token in {args.token_file}", hint="rse-pf token") from error
+        raise UsageError(f"cannot read the token in {request.token_file}", hint="rse-pf token") from error
     trusted = None
-    if args.authority is not None:
+    if request.authority is not None:
         try:
-            trusted = ssl.create_default_context(cafile=str(args.authority))
+            trusted = ssl.create_default_context(cafile=str(request.authority))
         except OSError as error:
-            raise UsageError(f"{args.authority} is no certificate", hint="name authority.crt") from error
-    return DataClient(args.url, token, DataOptions(ssl_context=trusted))
+            raise UsageError(f"{request.authority} is no certificate", hint="name authority.crt") from error
+    return DataClient(request.url, token, DataOptions(ssl_context=trusted))
 
 
-def _finish(args: argparse.Namespace, found: list[dict[str, Any]]) -> int:
+def _finish(request: LocaliseRequest, found: list[dict[str, Any]]) -> int:
     good = sum(each["verdict"] == "ok" for each in found)
-    if args.json:
+    if request.json:
         show_json(found, indent=2, sort_keys=True)
     else:
         show(f"{good} of {len(found)} found")

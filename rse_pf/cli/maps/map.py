@@ -25,165 +25,78 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import functools
 import time
 from collections import Counter
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from rse_pf.cli.maps.backup import add_backup_arguments, add_restore_arguments, run_backup, run_restore
-from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, export_bag, run_bags
-from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
-from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
-from rse_pf.cli.maps.localise import add_localise_arguments, is_remote, localise_frames, localise_photos
+from rse_pf.cli.maps.backup import BackupRequest, RestoreRequest, run_backup, run_restore
+from rse_pf.cli.maps.bags import FromBagRequest, ToBagRequest, export_bag, run_from_bag, run_to_bag
+from rse_pf.cli.maps.from_camera import FromCameraRequest, run_from_camera
+from rse_pf.cli.maps.live import LIVE_ACTIONS, run_publish
+from rse_pf.cli.maps.localise import LocaliseRequest, run_localise
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
-from rse_pf.command_line.map_store import open_maps, with_store
+from rse_pf.command_line.map_store import MapRequest, StoreRequest, VersionRequest
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
-from rse_pf.extensions.map_export.command import add_export_arguments, run_export
+from rse_pf.extensions.map_export.command import ExportRequest, run_export
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, compare_versions
 from rse_pf.maps.removal import choose_superseded, count_freed_bytes
-from rse_pf.terminal import at_work, counted, format_time, show, show_json
+from rse_pf.terminal import at_work, counted, format_time
 
-if TYPE_CHECKING:
-    pass
-
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _SHORT = 12
 _MAX_VALUE = 80
-_ACTIONS = {
-    "list": ("list the maps", "list"),
-    "show": ("show the contents and the origin of a version", "show kitchen --png kitchen.png"),
-    "view": ("draw a version as an image", "view kitchen --out kitchen.png"),
-    "merge": (
-        "merge several maps into one, or close the loops of one map",
-        "merge robot-1 robot-2 --into kitchen",
-    ),
-    "localise": ("estimate the camera poses of images in a map", "localise kitchen frame.png"),
-    "diff": ("show the differences between two versions", "diff kitchen 3f9bd1 head"),
-    "rollback": ("set the head to an earlier version", "rollback kitchen 3f9bd1"),
-    "prune": ("remove all but the newest versions", "prune kitchen --keep 10"),
-    "export": (
-        "write a version in the format of another program",
-        "export kitchen --format colmap --out kitchen-colmap",
-    ),
-    "backup": ("write all maps of a tenant into one file", "backup acme.maps --tenant acme"),
-    "restore": ("restore the maps of a tenant from a backup", "restore acme.maps --tenant acme"),
-    "publish": ("publish a live map as the next version of its map", "publish warehouse"),
-}
-"""Name, one line of help, and an example."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument(
-        "--store",
-        help="store of the maps: dir:PATH or s3:BUCKET (default: data.store, or that of rse-pf local)",
-    )
-    common.add_argument(
-        "--name",
-        dest="platform",
-        metavar="PLATFORM",
-        help="platform of this machine whose maps are meant (default: the one that runs here)",
-    )
-    common.add_argument(
-        "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
-    )
-    common.add_argument("--json", action="store_true", help="print JSON")
-    made = {
-        name: actions.add_parser(
-            name, parents=[common], help=text, description=f"{text[0].upper()}{text[1:]}.",
-            epilog=f"example:\n  rse-pf map {example} --store dir:objects",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        for name, (text, example) in _ACTIONS.items()
-    }  # fmt: skip
-    for name in ("show", "view", "diff", "rollback", "prune", "export", "localise", "publish"):
-        made[name].add_argument("name", metavar="MAP", help="name of the map")
-    for name in ("show", "view", "export"):
-        made[name].add_argument(
-            "version", nargs="?", default="head", metavar="VERSION", help="default: %(default)s"
-        )
-    made["show"].add_argument("--all", action="store_true", help="list every version")
-    made["show"].add_argument("--png", type=Path, metavar="FILE", help="write an image of the map")
-    made["view"].add_argument("--out", type=Path, metavar="FILE", help="the image (default: MAP.png)")
-    made["diff"].add_argument("before", metavar="BEFORE", help="a version")
-    made["diff"].add_argument(
-        "after", nargs="?", default="head", metavar="AFTER", help="default: %(default)s"
-    )
-    made["rollback"].add_argument("version", metavar="VERSION", help="the version to go back to")
-    made["prune"].add_argument(
-        "--keep", type=int, required=True, metavar="N", help="how many of the newest stay, besides the head"
-    )
-    add_export_arguments(made["export"])
-    add_backup_arguments(made["backup"])
-    add_restore_arguments(made["restore"])
-    add_from_camera_arguments(
-        actions.add_parser(
-            "from-camera", help="make a map from a camera, a video or images",
-            description="Make a map from a camera, a video or images, through a platform.",
-            epilog="example:\n  rse-pf map from-camera 0 --intrinsics intrinsics.json --scale marker:100",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-    )  # fmt: skip
-    add_bag_actions(actions)
-    add_live_arguments(
-        actions.add_parser(
-            "live", help="list, show, start, stop and correct live maps",
-            description="List, show, start, stop and correct live maps.",
-            epilog="example:\n  rse-pf map live show warehouse --store dir:objects",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        ),
-        common,
-    )  # fmt: skip
-    merge = made["merge"]
-    merge.add_argument(
-        "names",
+@dataclass(frozen=True, kw_only=True)
+class _ShowRequest(VersionRequest):
+    all: bool = option("--all", help="list every version")
+    png: Path | None = option("--png", metavar="FILE", help="write an image of the map")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ViewRequest(VersionRequest):
+    out: Path | None = option("--out", metavar="FILE", help="the image (default: MAP.png)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _MergeRequest(StoreRequest):
+    names: tuple[str, ...] = option(
         nargs="+",
         metavar="MAP",
         help="MAP or MAP@VERSION; the world frame of the first is kept; a single map gets its loops closed",
     )
-    merge.add_argument("--into", required=True, metavar="NAME", help="the map that gets a new version")
-    merge.add_argument("--note", default="", help="note of the new version")
-    add_localise_arguments(made["localise"])
+    into: str = option("--into", required=True, metavar="NAME", help="the map that gets a new version")
+    note: str = option("--note", default="", help="note of the new version")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Do one action and return the exit code."""
-    if args.action == "from-camera":
-        return run_from_camera(args, settings)
-    if args.action in BAG_ACTIONS:
-        return run_bags(args, settings)
-    if args.action == "localise" and is_remote(args):
-        return localise_photos(args)
-    if args.store is not None and args.platform is not None:
-        raise UsageError("--store and --name name two stores", hint="leave one of them out")
-    chosen = with_store(args.store, settings, args.platform)
-    if args.action in ("live", "publish"):
-        return (run_live if args.action == "live" else run_publish)(args, chosen)
-    if args.action in ("backup", "restore"):
-        return (run_backup if args.action == "backup" else run_restore)(args, chosen)
-    maps = open_maps(chosen, args.tenant)
-    actions: dict[str, Callable[[argparse.Namespace, MapRegistry], int | None]] = {
-        "list": _list,
-        "show": _show,
-        "view": _view,
-        "merge": _merge,
-        "localise": localise_frames,
-        "diff": _diff,
-        "rollback": _rollback,
-        "prune": _prune,
-        "export": functools.partial(run_export, write_bag=export_bag),
-    }
-    return actions[args.action](args, maps) or 0
+@dataclass(frozen=True, kw_only=True)
+class _DiffRequest(MapRequest):
+    before: str = option(metavar="BEFORE", help="a version")
+    after: str = option(nargs="?", default="head", metavar="AFTER", help="default: %(default)s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RollbackRequest(MapRequest):
+    version: str = option(metavar="VERSION", help="the version to go back to")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PruneRequest(MapRequest):
+    keep: int = option(
+        "--keep",
+        required=True,
+        metavar="N",
+        help="number of the newest versions to keep; the head is always kept",
+    )
 
 
 def _check_folder(file: Path) -> None:
@@ -194,33 +107,32 @@ def _check_folder(file: Path) -> None:
         )
 
 
-def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
+def _list(request: StoreRequest, settings: PlatformSettings) -> None:
+    maps = request.open_maps(settings)
     heads = {name: maps.head(name) for name in maps.names()}
-    _print(
-        args,
+    request.print(
         [{"name": name, **_fields(head)} for name, head in heads.items()],
         *([f"{name:<24} {_record_line(head)}" for name, head in heads.items()] or ["no maps"]),
     )
 
 
-def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
-    if args.png is not None:
-        _check_folder(args.png)
-    if args.all:
-        head = _id_of_head(args.name, maps)
-        records = maps.versions(args.name)
-        _print(
-            args,
+def _show(request: _ShowRequest, settings: PlatformSettings) -> None:
+    if request.png is not None:
+        _check_folder(request.png)
+    maps = request.open_maps(settings)
+    if request.all:
+        head = _id_of_head(request.name, maps)
+        records = maps.versions(request.name)
+        request.print(
             [{**_fields(record), "head": record.id == head} for record in records],
             *(f"{'*' if record.id == head else ' '} {_record_line(record)}" for record in records),
         )
         return
-    record = maps.record(args.name, args.version)
-    version = maps.load(args.name, record.id)
+    record = maps.record(request.name, request.version)
+    version = maps.load(request.name, record.id)
     kinds = Counter(str(edge.kind) for edge in version.edges)
     robots = Counter(keyframe.robot for keyframe in version.keyframes)
-    _print(
-        args,
+    request.print(
         {
             **_fields(record),
             "edges_by_kind": kinds,
@@ -241,45 +153,46 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
             ),
         ),
     )
-    if args.png is not None:
-        _draw(args, maps, record)
+    if request.png is not None:
+        _draw(request.png, request.name, maps, record)
 
 
-def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
-    record = maps.record(args.name, args.version)
-    args.png = args.out or Path(f"{args.name}.png")
-    _draw(args, maps, record)
-    _print(
-        args,
-        {"file": str(args.png), "id": record.id},
-        f"{args.png}: {args.name}, version {record.number}",
+def _view(request: _ViewRequest, settings: PlatformSettings) -> None:
+    maps = request.open_maps(settings)
+    record = maps.record(request.name, request.version)
+    out = request.out or Path(f"{request.name}.png")
+    _draw(out, request.name, maps, record)
+    request.print(
+        {"file": str(out), "id": record.id},
+        f"{out}: {request.name}, version {record.number}",
     )
 
 
-def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
+def _merge(request: _MergeRequest, settings: PlatformSettings) -> int:
     """Merge maps into the next version of one; the exit code is 1 if any was not joined."""
     from rse_pf.services.mapping.merge import MergeRequest, merge_maps
 
-    names = [_version_of(word) for word in args.names]
+    maps = request.open_maps(settings)
+    names = [_version_of(word) for word in request.names]
     records = [maps.record(*each) for each in names]
-    parent = _id_of_head(args.into, maps)
-    request = MergeRequest(
+    parent = _id_of_head(request.into, maps)
+    wanted = MergeRequest(
         maps=[maps.data(name, record.id) for (name, _), record in zip(names, records, strict=True)]
     )
     began = time.perf_counter()
-    reply = merge_maps(request, report=merge_progress)
+    reply = merge_maps(wanted, report=merge_progress)
     seconds = round(time.perf_counter() - began, 3)
-    origin = MapOrigin(parent=parent, author="rse-pf map merge", created_s=time.time(), note=args.note)
+    origin = MapOrigin(parent=parent, author="rse-pf map merge", created_s=time.time(), note=request.note)
     return commit_merge(
-        reply, maps, args.names, into=args.into, origin=origin,
-        json_fields={"seconds": seconds} if args.json else None,
+        reply, maps, request.names, into=request.into, origin=origin,
+        json_fields={"seconds": seconds} if request.json else None,
     )  # fmt: skip
 
 
-def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
-    found = compare_versions(maps.load(args.name, args.before), maps.load(args.name, args.after))
-    _print(
-        args,
+def _diff(request: _DiffRequest, settings: PlatformSettings) -> None:
+    maps = request.open_maps(settings)
+    found = compare_versions(maps.load(request.name, request.before), maps.load(request.name, request.after))
+    request.print(
         msgspec.to_builtins(found),
         *_rows(
             ("keyframes", f"+{len(found.added)} -{len(found.removed)}, {len(found.moved)} moved"),
@@ -290,44 +203,44 @@ def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
     )
 
 
-def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
-    head = maps.head(args.name)
-    record = maps.move_head(args.name, args.version, expected=head.id)
-    _print(
-        args,
+def _rollback(request: _RollbackRequest, settings: PlatformSettings) -> None:
+    maps = request.open_maps(settings)
+    head = maps.head(request.name)
+    record = maps.move_head(request.name, request.version, expected=head.id)
+    request.print(
         {"was": head.id, "head": record.id},
-        f"the head of {args.name} was {head.id[:_SHORT]} and is {record.id[:_SHORT]}",
+        f"the head of {request.name} was {head.id[:_SHORT]} and is {record.id[:_SHORT]}",
     )
 
 
-def _prune(args: argparse.Namespace, maps: MapRegistry) -> None:
-    if args.keep < 1:
-        raise UsageError(f"--keep {args.keep} is below 1", hint="1 keeps the head and the newest version")
-    removed = maps.remove(args.name, functools.partial(choose_superseded, keep=args.keep))
+def _prune(request: _PruneRequest, settings: PlatformSettings) -> None:
+    if request.keep < 1:
+        raise UsageError(f"--keep {request.keep} is below 1", hint="1 keeps the head and the newest version")
+    maps = request.open_maps(settings)
+    removed = maps.remove(request.name, functools.partial(choose_superseded, keep=request.keep))
     freed = count_freed_bytes(removed)
-    _print(
-        args,
+    request.print(
         {"removed": [_fields(record) for record in removed], "freed_bytes": freed},
         *map(_record_line, removed),
-        f"{counted(len(removed), 'version')} of {args.name} removed, {freed} bytes freed",
+        f"{counted(len(removed), 'version')} of {request.name} removed, {freed} bytes freed",
     )
 
 
-def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
+def _draw(png: Path, name: str, maps: MapRegistry, record: MapRecord) -> None:
     from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 
-    _check_folder(args.png)
-    version = maps.load(args.name, record.id)
+    _check_folder(png)
+    version = maps.load(name, record.id)
     if not version.keyframes:
         raise UsageError("a map without keyframes cannot be drawn", hint="export its cloud as ply")
     robots = []
     for robot in record.robots:
         own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
         robots.append(RobotPath(name=robot, T_world_camera=np.stack([k.T_world_camera for k in own])))
-    caption = f"{args.name}, version {record.number}: {counted(record.keyframes, 'keyframe')}, "
+    caption = f"{name}, version {record.number}: {counted(record.keyframes, 'keyframe')}, "
     caption += f"{record.points:,} point{'s' * (record.points != 1)}"
     with at_work("drawing the map"):
-        draw_map(args.png, version.points, version.colours, robots, caption)
+        draw_map(png, version.points, version.colours, robots, caption)
 
 
 def _id_of_head(name: str, maps: MapRegistry) -> str | None:
@@ -371,9 +284,101 @@ def _rows(*rows: tuple[str, object]) -> list[str]:
     return [f"{name:<11} {value}" for name, value in rows]
 
 
-def _print(args: argparse.Namespace, value: Any, *lines: str) -> None:
-    """Print *value* with ``--json``, else *lines*."""
-    if args.json:
-        show_json(value, indent=2, sort_keys=True)
-    else:
-        show(*lines)
+ACTION = Action(
+    actions={
+        "list": Action(
+            help="list the maps",
+            example="rse-pf map list --store dir:objects",
+            request=StoreRequest,
+            run=_list,
+        ),
+        "show": Action(
+            help="show the contents and the origin of a version",
+            example="rse-pf map show kitchen --png kitchen.png --store dir:objects",
+            request=_ShowRequest,
+            run=_show,
+        ),
+        "view": Action(
+            help="draw a version as an image",
+            example="rse-pf map view kitchen --out kitchen.png --store dir:objects",
+            request=_ViewRequest,
+            run=_view,
+        ),
+        "merge": Action(
+            help="merge several maps into one, or close the loops of one map",
+            example="rse-pf map merge robot-1 robot-2 --into kitchen --store dir:objects",
+            request=_MergeRequest,
+            run=_merge,
+        ),
+        "localise": Action(
+            help="estimate the camera poses of images in a map",
+            example="rse-pf map localise kitchen frame.png --store dir:objects",
+            request=LocaliseRequest,
+            run=run_localise,
+        ),
+        "diff": Action(
+            help="show the differences between two versions",
+            example="rse-pf map diff kitchen 3f9bd1 head --store dir:objects",
+            request=_DiffRequest,
+            run=_diff,
+        ),
+        "rollback": Action(
+            help="set the head to an earlier version",
+            example="rse-pf map rollback kitchen 3f9bd1 --store dir:objects",
+            request=_RollbackRequest,
+            run=_rollback,
+        ),
+        "prune": Action(
+            help="remove all but the newest versions",
+            example="rse-pf map prune kitchen --keep 10 --store dir:objects",
+            request=_PruneRequest,
+            run=_prune,
+        ),
+        "export": Action(
+            help="write a version in the format of another program",
+            example="rse-pf map export kitchen --format colmap --out kitchen-colmap --store dir:objects",
+            request=ExportRequest,
+            run=functools.partial(run_export, write_bag=export_bag),
+        ),
+        "backup": Action(
+            help="write all maps of a tenant into one file",
+            example="rse-pf map backup acme.maps --tenant acme --store dir:objects",
+            request=BackupRequest,
+            run=run_backup,
+        ),
+        "restore": Action(
+            help="restore the maps of a tenant from a backup",
+            example="rse-pf map restore acme.maps --tenant acme --store dir:objects",
+            request=RestoreRequest,
+            run=run_restore,
+        ),
+        "publish": Action(
+            help="publish a live map as the next version of its map",
+            example="rse-pf map publish warehouse --store dir:objects",
+            request=MapRequest,
+            run=run_publish,
+        ),
+        "from-camera": Action(
+            help="make a map from a camera, a video or images",
+            description="Make a map from a camera, a video or images, through a platform.",
+            example="rse-pf map from-camera 0 --intrinsics intrinsics.json --scale marker:100",
+            request=FromCameraRequest,
+            run=run_from_camera,
+        ),
+        "from-bag": Action(
+            help="make a map from a ROS bag, without ROS",
+            description="Make a map from a ROS 1 bag, or a ROS 2 bag (sqlite3, MCAP), through a platform.",
+            example="rse-pf map from-bag kitchen.bag --out out-bag",
+            request=FromBagRequest,
+            run=run_from_bag,
+        ),
+        "to-bag": Action(
+            help="write paths and clouds as a ROS bag",
+            description="Write the paths and the cloud of a folder of results as a ROS bag.",
+            example="rse-pf map to-bag out-bag --out map.mcap",
+            request=ToBagRequest,
+            run=run_to_bag,
+        ),
+        "live": Action(help="list, show, start, stop and correct live maps", actions=LIVE_ACTIONS),
+    }
+)

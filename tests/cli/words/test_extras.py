@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.cli import extras
 from rse_pf.cli.main import VERBS, main
+from rse_pf.command_line import extras
 from rse_pf.command_line.extras import EXTRAS, VERBS_NEED, extra_of_module, modules_of, require
 from rse_pf.errors import MissingExtra
 
