@@ -55,13 +55,13 @@ def test_a_refusal_of_whoever_stands_between_is_temporary(status, body):
 def test_every_refusal_of_the_handshake_carries_the_mark():
     policy = HandshakePolicy(PlatformSettings(), KeySet({}))
 
-    refused = policy.judge(
+    refused = policy.decide(
         HandshakeRequest(path=b"/ws", authorization="Bearer x", offered=["rse-pf.v1.json"]),
         is_full=False,
         anonymous="",
         now_s=0.0,
     )
-    origin = policy.judge(
+    origin = policy.decide(
         HandshakeRequest(path=b"/ws", authorization="", offered=[], origin="https://elsewhere.example"),
         is_full=False,
         anonymous="",

@@ -5,7 +5,8 @@ from __future__ import annotations
 from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.server.gateway.admission import MAX_QUEUE_PER_ROBOT, Admission
-from rse_pf.server.scheduling.scheduler import QueuedCommand, RefusedCommand, Scheduler
+from rse_pf.server.scheduling.command_queue import QueuedCommand, RefusedCommand
+from rse_pf.server.scheduling.scheduler import Scheduler
 from rse_pf.wire import Command
 
 
@@ -26,7 +27,7 @@ class AdmittedScheduler(Scheduler):
         self._admission = Admission(SessionSettings(), max_queue=max_queue)
 
     def submit(self, command: QueuedCommand, now: float = 0.0) -> list[RefusedCommand]:
-        refusal = self._admission.judge(command, None, self.backlog(command))
+        refusal = self._admission.refusal(command, None, self.backlog(command))
         if refusal is None:
             return super().submit(command)
         return [refusal]

@@ -15,16 +15,9 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Busy, Forbidden
 from rse_pf.server.gateway.rate_limits import RobotRates
+from rse_pf.server.scheduling.command_queue import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.server.scheduling.overload import PAUSE_S
-from rse_pf.server.scheduling.scheduler import (
-    BEHIND,
-    BEHIND_HINT,
-    QueueBacklog,
-    QueuedCommand,
-    RefusedCommand,
-    behind_error,
-    expired_error,
-)
+from rse_pf.server.scheduling.scheduler import BEHIND, BEHIND_HINT, behind_error, expired_error
 
 __all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
 
@@ -76,7 +69,7 @@ class Admission:
         share = _SUSPECTS_SHARE if bad_messages else 1.0
         return not unread_bytes or unread_bytes + size_bytes <= share * _MAX_UNREAD_BYTES
 
-    def judge(
+    def refusal(
         self, queued: QueuedCommand, claims: Claims | None, backlog: QueueBacklog
     ) -> RefusedCommand | None:
         """Return why a decoded command is refused; None if it is admitted.

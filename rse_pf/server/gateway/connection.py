@@ -114,9 +114,6 @@ class RobotConnection:
     def receive_frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
         """Receive one unmasked frame."""
         now = self._context.clocks.monotonic()
-        if self._assembler.is_whole(opcode, fin, rsv, len(payload)):
-            self._take(payload, False, now)
-            return
         decision = self._assembler.receive(opcode, fin, rsv, payload, now)
         if isinstance(decision, Received):
             self._take(decision.data, decision.is_text, now)

@@ -28,8 +28,7 @@ from rse_pf.server.gateway.stateless_queue import StatelessQueue
 from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.ports import Wire, WorkerContext
-from rse_pf.server.scheduling.command_queue import CommandQueue
-from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
+from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import CODECS, Codec, Command
 from rse_pf.wire.envelope import peek
@@ -313,11 +312,10 @@ class Dispatcher:
         if self.stateless.runs_at_once(queued):
             return
         queue = self._queue_of(command.service)
-        judges_itself = queue is not None and queue.judges_scope
-        claims = None if judges_itself else connection.claims
+        claims = None if queue is not None and queue.checks_scope else connection.claims
         is_held = connection.ignores_pauses and queue is self.stateless
         backlog = QueueBacklog() if queue is None or is_held else queue.backlog(queued)
-        refusal = self.admission.judge(queued, claims, backlog)
+        refusal = self.admission.refusal(queued, claims, backlog)
         if refusal is not None:
             if queue is self.stateless and isinstance(refusal.error, Busy):
                 connection.pause(1e-3 * (refusal.error.retry_after_ms or 0.0), now)

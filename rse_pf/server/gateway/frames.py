@@ -85,17 +85,6 @@ class FrameAssembler:
         self._size = 0
         self._control_frames = TokenBucket(max_control_per_s, max_control_per_s)
 
-    def is_whole(self, opcode: int, fin: bool, rsv: bool, size_bytes: int) -> bool:
-        """Return whether a frame is a binary message that `receive` would return as it is, as most are."""
-        return (
-            opcode == BINARY
-            and fin
-            and not rsv
-            and not self.closed
-            and self._message is None
-            and size_bytes <= self._limits.max_message_bytes
-        )
-
     def receive(self, opcode: int, fin: bool, rsv: bool, payload: bytes, now: float) -> FrameDecision | None:
         """Return the decision about one unmasked frame that arrived at *now* (s); None waits for more."""
         if self.closed:

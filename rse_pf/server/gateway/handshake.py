@@ -244,7 +244,7 @@ class HandshakePolicy:
             f"offer one of {', '.join(SUBPROTOCOLS.values())}",
         )  # fmt: skip
 
-    def judge(
+    def decide(
         self,
         request: HandshakeRequest,
         *,

@@ -307,7 +307,7 @@ class RobotSockets:
         now = self._context.clocks.monotonic()
         if self._sources.wait_s(source, now) > 0:
             return replace(self._handshake.too_fast, reason="address-rate")
-        verdict = self._handshake.judge(
+        verdict = self._handshake.decide(
             HandshakeRequest(
                 path=head.path,
                 authorization=authorization,

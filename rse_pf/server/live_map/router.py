@@ -30,8 +30,7 @@ from rse_pf.identity import RobotId
 from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.subscriptions import Subscriptions
 from rse_pf.server.ports import Subscriber, WorkerContext
-from rse_pf.server.scheduling.command_queue import CommandQueue, QueueReport
-from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand
+from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
 from rse_pf.service import failure_of
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_odometry_range, decode_keyframe
 from rse_pf.wire import Failure, Result, as_type
@@ -72,7 +71,7 @@ _BUSY_RETRY_MS = 500.0
 class LiveMapRouter(CommandQueue):
     """The live maps as the robots of one worker use them: a queue of commands, and subscriptions."""
 
-    judges_scope = True
+    checks_scope = True
     """The caller does not check the scope of a command: this class does, since the scope names the map."""
 
     def __init__(

@@ -14,7 +14,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.server.sandbox.manager import SandboxHost, SandboxManager
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result

@@ -39,7 +39,7 @@ from rse_pf.server.sandbox.policy import (
 )
 from rse_pf.server.sandbox.replies import is_ready, outcome_of
 from rse_pf.server.sandbox.zygote_client import ZygoteClient
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.storage.object_store import ObjectStore

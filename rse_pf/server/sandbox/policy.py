@@ -30,7 +30,7 @@ from rse_pf.identity import RobotId
 from rse_pf.limits.fair_queue import largest_holder
 from rse_pf.processes.ipc import encode_message
 from rse_pf.server.sandbox.circuit_breaker import CircuitBreaker
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.service import Kind
 
 __all__ = [

@@ -18,8 +18,7 @@ from typing import Any
 from rse_pf.identity import RobotId
 from rse_pf.server.sandbox.circuit_breaker import Block
 from rse_pf.server.sandbox.manager import SandboxHost, SandboxManager
-from rse_pf.server.scheduling.command_queue import CommandQueue, QueueReport
-from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand
+from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
 from rse_pf.service import failure_of, unknown_service
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Failure, Result

@@ -1,6 +1,6 @@
-"""The one protocol of everything in which the commands of a worker wait for their answers.
+"""The interface of the queues in which commands wait for their answers, and the values that it passes.
 
-The dispatcher of a worker holds a list of queues and knows nothing else of them.  All methods are called in
+The dispatcher of a worker holds a list of queues and uses nothing else of them.  All methods are called in
 the event loop of the worker, and none of them blocks.
 """
 
@@ -8,20 +8,79 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
-from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand
+import msgspec
 
-__all__ = ["CommandQueue", "QueueReport"]
+from rse_pf.errors import RsePfError
+from rse_pf.identity import RobotId
+from rse_pf.wire import Command
+
+__all__ = ["CommandQueue", "QueueBacklog", "QueueReport", "QueuedCommand", "RefusedCommand"]
+
+
+class QueuedCommand(msgspec.Struct, eq=False):
+    """One command from its arrival to its answer; times are monotonic seconds.
+
+    Attributes:
+        owner: The connection that waits for the answer.
+        robot: The robot of that connection.
+        command: The command as decoded.
+        size_bytes: Its length on the wire.
+        received_s: When it arrived.
+        deadline_s: After this its answer is of no use.
+        started_s: When its computation began; 0 while it waits.
+        position: Its position when it was queued, from 1; a frame that replaces a waiting one inherits it.
+        queued_s: When that position was taken.
+    """
+
+    owner: Any
+    robot: RobotId
+    command: Command
+    size_bytes: int
+    received_s: float
+    deadline_s: float
+    started_s: float = 0.0
+    position: int = 1
+    queued_s: float = 0.0
+
+    @property
+    def allowed_s(self) -> float:
+        """Time from its arrival to its deadline."""
+        return self.deadline_s - self.received_s
+
+
+class QueueBacklog(NamedTuple):
+    """What would delay one more command of a robot.
+
+    Attributes:
+        waiting: How many commands of the robot wait in the same queue.
+        pause_s: How long the robot has to pause because the command would wait for too long; 0 accepts it.
+    """
+
+    waiting: int = 0
+    pause_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedCommand:
+    """A command that is answered without being computed.
+
+    ``reason`` is a label of the metric ``rse_pf_shed_total``.
+    """
+
+    queued: QueuedCommand
+    error: RsePfError
+    reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueueReport:
-    """The numbers of one queue.
+    """The metrics of one queue.
 
     Attributes:
-        gauges: For ``/metrics``, by their names.
-        cpu_s: Processor time by kind of work and tenant, of work outside of the worker's own threads.
+        gauges: Values for ``/metrics``, by the name of the metric.
+        cpu_s: CPU seconds by kind of work and by tenant, of work in other processes.
         sections: Further parts of the worker's report, by their names.
     """
 
@@ -31,41 +90,41 @@ class QueueReport:
 
 
 class CommandQueue(Protocol):
-    """Commands that wait or run; a queue names this class as its base and may leave the last methods out."""
+    """Commands that wait or run; a queue has this class as its base, and may leave the last methods out."""
 
-    judges_scope: bool = False
+    checks_scope: bool = False
     """Whether it checks the scopes of tokens itself, by more than the name of the service."""
 
     @property
     def held(self) -> int:
-        """Commands that the worker must answer before it ends."""
+        """Commands that the worker must answer before it exits."""
 
     def offers(self, service: str) -> bool:
-        """Return whether commands to *service* wait here, now."""
+        """Return whether this queue takes commands to *service* now."""
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return what would delay *queued*, which is offered here."""
+        """Return what would delay *queued*, whose service this queue offers."""
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Take *queued*, which was admitted at *now*; it is answered once, unless its connection ends."""
+        """Take *queued*, which was admitted at *now* (s); answer it once, unless its connection ends."""
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """The robot of the connection *owner* cancelled a command: end it, unless it is answered soon."""
+        """Cancel a command of the connection *owner*, unless it is answered soon."""
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
         """Forget the connection *owner*, which ended; return its commands that are dropped."""
 
     def report(self) -> QueueReport:
-        """Return the present numbers."""
+        """Return the present metrics."""
 
     def enter(self, owner: Any) -> None:
-        """Note the connection *owner*, whose robot is known from now on."""
+        """Note the connection *owner*, whose handshake is done."""
         return
 
     def give_up(self) -> None:
-        """The server drains: leave to other servers what they can go on with."""
+        """Leave to other servers what they can continue, because this server drains."""
         return
 
     def close(self) -> None:
-        """End what works for this queue; commands that are held may stay unanswered."""
+        """Stop the threads and processes of this queue; commands that are held may stay unanswered."""
         return

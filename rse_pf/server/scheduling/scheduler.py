@@ -1,30 +1,31 @@
-"""Decide which command runs next: fair between tenants and robots, newest frame of a stream first.
+"""Decide which command runs next, and which is refused because it would wait for too long.
 
-At most one command of a robot runs, in the order of `FairQueue`; all that run may be of one tenant, since
-each has a deadline.  Within a stream the newest frame replaces the one that waits, unless it says ``keep``.
-A command whose deadline passed never runs, and `Overload` says what is refused because it would wait for too
-long.  The scheduler has no thread and no clock: commands and times go in, commands and refusals come out.
+- Order: fair between tenants, then between the robots of a tenant (`FairQueue`).  At most one command of a
+  robot runs at a time.
+- Streams: the newest frame of a stream replaces the one that waits, and inherits its position, unless the
+  waiting frame was sent with ``keep``.
+- Deadlines: a command whose deadline has passed never runs.
+- Overload: `OverloadControl` decides from the expected wait which commands are refused.
+
+The scheduler has no thread and no clock: commands and times go in, commands and refusals come out.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgspec
-
-from rse_pf.errors import Busy, Expired, RsePfError, Stale
+from rse_pf.errors import Busy, Expired, Stale
 from rse_pf.identity import RobotId
 from rse_pf.limits.fair_queue import FairQueue
-from rse_pf.server.scheduling.overload import PAUSE_S, Overload, TurnTime, is_too_late
-from rse_pf.wire import Command
+from rse_pf.server.scheduling.command_queue import QueueBacklog, QueuedCommand, RefusedCommand
+from rse_pf.server.scheduling.overload import PAUSE_S, OverloadControl, WaitPerPosition, is_too_late
 
 __all__ = [
     "BEHIND",
     "BEHIND_HINT",
     "INLINE_BYTES",
-    "QueueBacklog",
     "QueuedCommand",
     "RefusedCommand",
     "Scheduler",
@@ -35,67 +36,22 @@ __all__ = [
 BEHIND = "the server is behind with its work"
 BEHIND_HINT = "try again later; another server may have been added"
 
-INLINE_BYTES = 16_384
-"""A cheap command up to this size is computed in the event loop when nothing waits."""
+INLINE_BYTES = 16_384  # a larger command is computed in a thread: decoding it would delay other robots
 SHORT_COMPUTE_S = 0.001  # passing a command to a thread costs 0.1 ms of CPU and up to 5 ms of waiting for it
-SHORT_SHARE = (
-    0.8  # of the last commands were short: a share, since a process that others interrupt is not slow
-)
-SMOOTHING = 0.1  # weight of the last command in that share: about ten commands count
-
-
-class QueuedCommand(msgspec.Struct, eq=False):
-    """One command from its arrival to its answer; ``owner`` is the connection that waits for the answer.
-
-    A frame that replaces a waiting one inherits its ``position`` in the queue and ``queued_s``, the time at
-    which that position was taken.
-    """
-
-    owner: Any
-    robot: RobotId
-    command: Command
-    size_bytes: int
-    received_s: float
-    deadline_s: float
-    started_s: float = 0.0
-    position: int = 1
-    queued_s: float = 0.0
-
-    @property
-    def allowed_s(self) -> float:
-        """Time from its arrival to its deadline."""
-        return self.deadline_s - self.received_s
-
-
-class QueueBacklog(NamedTuple):
-    """What would delay one more command of a robot.
-
-    Attributes:
-        waiting: How many commands of the robot wait in the same queue.
-        pause_s: For how long the robot pauses because the command would wait for too long; 0 accepts it.
-    """
-
-    waiting: int = 0
-    pause_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class RefusedCommand:
-    """A command that ends without compute; ``reason`` is a label of the metric ``rse_pf_shed_total``."""
-
-    queued: QueuedCommand
-    error: RsePfError
-    reason: str
+MIN_SHORT_SHARE = 0.8  # of the last commands: some are long only because the process was interrupted
+SHORT_SHARE_SMOOTHING = 0.1  # weight of the last command in that share: about ten commands count
 
 
 class Scheduler:
-    """The queue of one worker."""
+    """The waiting and running commands of one queue."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_running: float = math.inf) -> None:
+        """Hold no command yet; at most *max_running* run at a time."""
         self.running = 0
+        self._max_running = max_running
         self._queue: FairQueue[QueuedCommand] = FairQueue(max_running_per_robot=1)
-        self._overload = Overload()
-        self._turn = TurnTime()
+        self._overload = OverloadControl()
+        self._wait_per_position = WaitPerPosition()
         self._short_share = 0.0
 
     @property
@@ -104,27 +60,27 @@ class Scheduler:
         return len(self._queue)
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return what would delay *queued*: nothing if it replaces another frame."""
+        """Return what would delay *queued*: nothing if it replaces a waiting frame."""
         waiting = self._queue.items_of(queued.robot)
-        if _replaceable(waiting, queued) is not None:
+        if _frame_to_replace(waiting, queued) is not None:
             return QueueBacklog()
         return QueueBacklog(len(waiting), self._pause_s(queued.robot, queued.allowed_s))
 
     def unread_pause_s(self, robot: RobotId, allowed_s: float) -> float:
-        """Return the pause of a robot, in seconds, if its next command would wait too long; 0 accepts it.
+        """Return the pause of *robot* in seconds if its undecoded command would wait too long; 0 accepts it.
 
-        The command is not decoded yet, so its deadline is not known: *allowed_s*, the time that the robot's
-        last command had until its deadline, stands for it.  A command that may replace a waiting frame of
-        its stream is accepted.
+        The deadline of the command is not known yet.  *allowed_s*, the time that the robot's last command had
+        from its arrival to its deadline, is used instead.  The command is accepted if the robot has a waiting
+        frame that it may replace.
         """
         if any(map(_is_replaceable, self._queue.items_of(robot))):
             return 0.0
         return self._pause_s(robot, allowed_s)
 
     def submit(self, queued: QueuedCommand) -> list[RefusedCommand]:
-        """Queue *queued*, which was admitted; return the frame of its stream that ends instead."""
+        """Queue *queued*, which was admitted; return the older frame of its stream, which it replaces."""
         waiting = self._queue.items_of(queued.robot)
-        older = _replaceable(waiting, queued)
+        older = _frame_to_replace(waiting, queued)
         if older is not None:
             if queued.command.seq < older.command.seq:
                 return [_stale(queued)]
@@ -137,10 +93,16 @@ class Scheduler:
         return []
 
     def start(self, now: float) -> tuple[QueuedCommand | None, list[RefusedCommand]]:
-        """Return the command whose turn it is, now running, and those that were given up on the way."""
+        """Start the next command, unless as many run as may; *now* is in seconds.
+
+        Returns:
+            The command, which runs from now on, or None; and the commands before it that waited for too long.
+        """
         refusals: list[RefusedCommand] = []
+        if self.running >= self._max_running:
+            return None, refusals
         while (queued := self._queue.take()) is not None:
-            self._turn.note(now - queued.queued_s, queued.position)
+            self._wait_per_position.note(now - queued.queued_s, queued.position)
             if queued.deadline_s > now and not is_too_late(now - queued.received_s, queued.allowed_s):
                 queued.started_s = now
                 self.running += 1
@@ -150,25 +112,25 @@ class Scheduler:
         return None, refusals
 
     def start_unqueued(self, queued: QueuedCommand, now: float) -> bool:
-        """Start *queued* without a place in the queue; False if others wait or run, or it is too late.
+        """Start *queued* without queueing it; False if commands wait or run, or its deadline has passed.
 
-        `finish_unqueued` ends the command.
+        `finish_unqueued` must be called when it is computed.
         """
         if self._queue or self.running or queued.deadline_s <= now:
             return False
         self._overload.note_accepted(queued.robot.tenant, now)
-        self._turn.note(0.0, 1)
+        self._wait_per_position.note(0.0, 1)
         queued.started_s = now
         self.running = 1
         return True
 
     def finish_unqueued(self, queued: QueuedCommand, now: float) -> None:
-        """Note the end of the compute of a command that `start_unqueued` started."""
+        """Note that a command which `start_unqueued` started is computed."""
         self.running = 0
         self._note_compute(now - queued.started_s)
 
     def done(self, queued: QueuedCommand, now: float) -> None:
-        """Note that the compute of *queued* ended; another command of its robot may run."""
+        """Note that *queued* is computed; another command of its robot may run."""
         self.running -= 1
         self._note_compute(now - queued.started_s)
         self._queue.release(queued.robot)
@@ -182,24 +144,24 @@ class Scheduler:
         return max(0.0, now - min((queued.received_s for queued in self._queue), default=now))
 
     def runs_inline(self, *, cheap: bool, size_bytes: int) -> bool:
-        """Return whether the command just started may run in the event loop.
+        """Return whether the command that was just started may run in the event loop.
 
-        It may if it is small and no thread would save time: nothing else waits, or it is answered sooner than
-        two threads pass the interpreter lock to each other.
+        It may if it is small, and if a thread would save no time: nothing else waits, or most of the last
+        commands took less time than passing the interpreter lock to another thread.
         """
-        saves_time = not self._queue or self._short_share >= SHORT_SHARE
+        saves_time = not self._queue or self._short_share >= MIN_SHORT_SHARE
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
     def _pause_s(self, robot: RobotId, allowed_s: float) -> float:
-        expected_wait_s = (self._queue.position(robot) - 1) * self._turn.mean_s
+        expected_wait_s = (self._queue.position(robot) - 1) * self._wait_per_position.mean_s
         return self._overload.pause_s(robot.tenant, expected_wait_s, allowed_s)
 
     def _note_compute(self, spent_s: float) -> None:
-        self._short_share += SMOOTHING * ((spent_s <= SHORT_COMPUTE_S) - self._short_share)
+        self._short_share += SHORT_SHARE_SMOOTHING * ((spent_s <= SHORT_COMPUTE_S) - self._short_share)
 
 
 def behind_error(pause_s: float) -> Busy:
-    """Return the error of a command that would wait for too long, or did; its robot pauses for *pause_s*."""
+    """Return the error of a command that waited or would wait for too long; its robot pauses *pause_s*."""
     return Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=1e3 * pause_s)
 
 
@@ -217,7 +179,7 @@ def _refuse_late(queued: QueuedCommand, now: float) -> RefusedCommand:
     return RefusedCommand(queued, behind_error(PAUSE_S), "behind")
 
 
-def _replaceable(waiting: deque[QueuedCommand], queued: QueuedCommand) -> QueuedCommand | None:
+def _frame_to_replace(waiting: deque[QueuedCommand], queued: QueuedCommand) -> QueuedCommand | None:
     stream = queued.command.stream
     if not _is_replaceable(queued):
         return None

@@ -12,7 +12,7 @@ from rse_pf.errors import Busy, WorkerLost
 from rse_pf.identity import RobotId
 from rse_pf.processes.limited import Overran
 from rse_pf.server.compute.limited_services import LimitedServices
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.wire import Command, Failure, Result
 from tests.kit.worker_parts import WorkerParts, worker_parts
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.wire import Command, Failure, Result
 from tests.kit.worker_parts import worker_parts
 

@@ -13,8 +13,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId, object_name
 from rse_pf.server.gateway.answers import EncodedAnswer
 from rse_pf.server.gateway.connection import RobotConnection
-from rse_pf.server.scheduling.command_queue import CommandQueue, QueueReport
-from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand
+from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
 from rse_pf.service import Registry
 from rse_pf.storage.object_store import MemoryStore, digest_of
 from rse_pf.wire import Cancel, Command, Failure, Move, Ping, Pong, Result, Welcome

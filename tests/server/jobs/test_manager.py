@@ -23,7 +23,7 @@ from rse_pf.server.jobs.manager import JobManager
 from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.runner import JobContext
 from rse_pf.server.jobs.slots import JobSlots, make_slot_file
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
 from tests.kit.fakes import FakeLog, FakeLoop

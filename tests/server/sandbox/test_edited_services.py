@@ -19,7 +19,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.server.sandbox.manager import SandboxHost, SandboxManager
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.dependencies import Dependencies, platform_tag, tree_digest
 from rse_pf.services.custom.installed import InstalledService, install, installed_services

@@ -26,7 +26,7 @@ from rse_pf.server.sandbox.policy import (
     SaveSnapshot,
     SendMessage,
 )
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.wire import Command
 
 GRACE_S = 5.0

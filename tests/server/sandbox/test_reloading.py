@@ -14,7 +14,7 @@ from rse_pf.errors import ConfigurationError
 from rse_pf.identity import RobotId
 from rse_pf.server.sandbox.manager import SandboxHost
 from rse_pf.server.sandbox.reloading import ReloadingSandboxes
-from rse_pf.server.scheduling.scheduler import QueuedCommand
+from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Command, Failure, Result
 from tests.kit.fakes import FakeLog, FakeLoop

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import pytest
 
 from rse_pf.identity import RobotId
-from rse_pf.server.scheduling.overload import PAUSE_S, Overload
+from rse_pf.server.scheduling.overload import PAUSE_S, OverloadControl
 from rse_pf.server.scheduling.scheduler import Scheduler
 from tests.kit.admitted_commands import queued
 
@@ -34,7 +34,7 @@ CAPACITY_PER_S = 1 / WORK_S
 def test_the_refused_share_grows_with_the_expected_wait(
     wait_s: float, allowed_s: float, refused_percent: int
 ):
-    rule, pauses_s = Overload(), []
+    rule, pauses_s = OverloadControl(), []
     for _ in range(1000):
         pauses_s.append(rule.pause_s("t", wait_s, allowed_s))
         if not pauses_s[-1]:
@@ -48,14 +48,14 @@ def test_the_refused_share_grows_with_the_expected_wait(
 
 
 def test_the_answer_to_an_accepted_command_stays_until_it_is_counted():
-    rule = Overload()
+    rule = OverloadControl()
     while rule.pause_s("t", 0.1, DEADLINE_S):
         pass
 
     assert [rule.pause_s("t", 0.1, DEADLINE_S) for _ in range(9)] == [0.0] * 9
 
 
-def sometimes_refused(rule: Overload, tenant: str) -> bool:
+def sometimes_refused(rule: OverloadControl, tenant: str) -> bool:
     """Return whether one of a few commands of *tenant* would be refused."""
     for _ in range(8):
         if rule.pause_s(tenant, 9.0, DEADLINE_S):
@@ -65,7 +65,7 @@ def sometimes_refused(rule: Overload, tenant: str) -> bool:
 
 
 def test_nothing_is_refused_of_a_tenant_that_got_less_than_the_others_of_late():
-    rule = Overload()
+    rule = OverloadControl()
     for number in range(100):
         rule.note_accepted("much", 0.0)
         if number % 4 == 0:

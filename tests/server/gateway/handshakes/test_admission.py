@@ -10,7 +10,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.server.gateway.admission import Admission
-from rse_pf.server.scheduling.scheduler import QueueBacklog
+from rse_pf.server.scheduling.command_queue import QueueBacklog
 from tests.kit.admitted_commands import queued
 
 ADMITTED: dict[str, Any] = {
@@ -31,7 +31,7 @@ def admission(monkeypatch: pytest.MonkeyPatch) -> Admission:
 
 
 def reason(admission: Admission, **changed: object) -> str:
-    refusal = admission.judge(**{**ADMITTED, **changed})
+    refusal = admission.refusal(**{**ADMITTED, **changed})
     return "" if refusal is None else refusal.reason
 
 
@@ -53,7 +53,7 @@ def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
 def test_a_command_beyond_a_limit_is_refused_for_its_reason(
     admission: Admission, changed: dict, expected: str, code: str
 ):
-    refusal = admission.judge(**{**ADMITTED, **changed})
+    refusal = admission.refusal(**{**ADMITTED, **changed})
 
     assert refusal is not None
     assert (refusal.reason, refusal.error.code) == (expected, code)

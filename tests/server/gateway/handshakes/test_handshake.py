@@ -39,7 +39,7 @@ def judge(policy: HandshakePolicy | None = None, **changed: object) -> Accepted 
     }  # fmt: skip
     worker = {name: asked.pop(name) for name in ("is_full", "anonymous", "now_s")}
     policy = policy or HandshakePolicy(SETTINGS, KEY.key_set())
-    return policy.judge(HandshakeRequest(**asked), **worker)
+    return policy.decide(HandshakeRequest(**asked), **worker)
 
 
 def test_a_valid_token_gives_the_robot_and_the_end_of_its_connection():

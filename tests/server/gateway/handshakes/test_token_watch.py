@@ -37,7 +37,7 @@ class Worker(WorkerParts):
 
     def record_verdict(self, token: str) -> Accepted:
         """Judge a handshake that is good."""
-        accepted = self.handshake.judge(
+        accepted = self.handshake.decide(
             HandshakeRequest(
                 path=b"/ws", authorization=f"Bearer {token}", offered=[SUBPROTOCOLS["bin"]]
             ),
