@@ -1,11 +1,17 @@
 """Decide whose work is next: fair between tenants, then between the robots of a tenant.
 
-The tenant with the fewest running items goes first, of several the first in line: who arrives, and who begins
-or ends an item, goes to the end of the line.  Within a tenant the same holds for its robots.  So a tenant
-with many robots, or with slow work, takes no more than another tenant that waits.  The items of a robot keep
-their order.
+This is hierarchical fair queueing by round robin, with two levels:
 
-Pure: no thread and no clock.
+1. The tenant with the fewest running items is next; of several, the one that has waited longest since it was
+   added, or since one of its items began or ended.
+2. Within that tenant, its robots are chosen by the same rule.
+3. The items of a robot are taken first in, first out.
+
+A tenant with many robots, or with slow work, therefore gets no more items running than another tenant whose
+items wait.  Pure: no thread and no clock.
+
+Source:
+    Nagle 1987, On packet switches with infinite storage (fair queueing by round robin).
 """
 
 from __future__ import annotations

@@ -1,8 +1,14 @@
-"""Decide whether a server takes a command.
+"""Decide whether a command is admitted or refused.
 
-Before a message is decoded, when a refusal is cheapest: the rate of the robot (`RobotRates`), the backlog of
-the server (`Scheduler.unread_pause_s`) and the size, in this order.  Once the command is decoded: its scope,
-its deadline, the number of commands of the robot that wait, and the backlog again.
+Before a message is decoded, when a refusal costs least, the dispatcher checks:
+
+1. the rate of the robot (`RobotRates`),
+2. the backlog of the server (`Scheduler.unread_pause_s`),
+3. for a long message, the bytes that wait for the decoder thread (`Admission.may_wait`).
+
+`Admission.refusal` checks the decoded command: its scope, its deadline, how many commands of the robot wait,
+and the backlog again, now that the deadline is known.
+
 Values go in and decisions come out: there is no clock, no queue and no connection here.
 """
 
@@ -21,12 +27,9 @@ from rse_pf.server.scheduling.scheduler import BEHIND, BEHIND_HINT, behind_error
 
 __all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
 
-MAX_QUEUE_PER_ROBOT = 8
-"""Queued commands of one robot, as many as may be unanswered by default; more are refused."""
-_MAX_UNREAD_BYTES = 1 << 24
-"""Bytes of long messages that may wait for the decoder thread of a worker."""
-_SUSPECTS_SHARE = 0.25
-"""Share of `_MAX_UNREAD_BYTES` that is open to robots which sent undecodable messages before."""
+MAX_QUEUE_PER_ROBOT = 8  # waiting commands of one robot: as many as it may have unanswered by default
+_MAX_UNREAD_BYTES = 1 << 24  # long messages that may wait for the decoder thread of a worker: 64 of 256 KiB
+_SUSPECTS_SHARE = 0.25  # of that, for robots that sent undecodable messages: they leave room to the others
 
 
 class UnreadRefusal(NamedTuple):
@@ -52,7 +55,7 @@ DECODER_FULL = UnreadRefusal(
 
 
 class Admission:
-    """The limits of one worker, and how much of its rate each robot has used."""
+    """The limits of one worker, and the token buckets of its robots."""
 
     def __init__(self, session: SessionSettings, *, max_queue: int = MAX_QUEUE_PER_ROBOT) -> None:
         self.rates = RobotRates(session)

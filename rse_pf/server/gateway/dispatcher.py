@@ -20,7 +20,6 @@ from rse_pf.errors import Busy, NotFound, ProtocolError, UnknownService
 from rse_pf.server.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
 from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.connection import RobotConnection
-from rse_pf.server.gateway.decoder_thread import DecoderThread
 from rse_pf.server.gateway.handshake import Accepted
 from rse_pf.server.gateway.idle_timeouts import IdleTimeouts
 from rse_pf.server.gateway.rate_limits import CUT_OFF
@@ -29,6 +28,7 @@ from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.ports import Wire, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, RefusedCommand
+from rse_pf.server.scheduling.decoder_thread import DecoderThread
 from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import CODECS, Codec, Command
 from rse_pf.wire.envelope import peek

@@ -1,8 +1,9 @@
-"""Decide when a worker closes an idle connection: no Hello in time, or no message for too long.
+"""Close idle connections: no Hello in time, or no message for longer than ping interval and ping timeout.
 
-Only the robot's silence counts.  Time in which the worker itself did not run is not counted, and a connection
-is closed only after the sockets were read once more.  It is noticed within one tick of its limit, which is
-far below ``session.ping_timeout_s``.  Times go in and closes come out: there is no clock and no loop here.
+Only the silence of the robot counts.  Time in which the worker itself was stopped is not counted, and a
+connection is closed only after its socket was read once more.  A connection is closed at the first tick after
+its limit, and ticks are far shorter than ``session.ping_timeout_s``.  Time is an argument: there is no clock
+and no event loop here.
 """
 
 from __future__ import annotations
@@ -15,16 +16,14 @@ from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_PROTOCOL
 
 __all__ = ["IdleTimeouts", "max_silence_s"]
 
-_MAX_TICK_S = 0.25
-_TICKS_PER_LIMIT = 4
-_READ_S = 0.001
-"""A loop that has a timer to wait for, however short, reads its sockets before."""
-_STOPPED_S = 1.0
-"""A tick that is later than this was not delayed by work: the process was stopped, swapped out or frozen."""
+_MAX_TICK_S = 0.25  # longest time between two ticks: a small part of every limit
+_TICKS_PER_LIMIT = 4  # a short Hello timeout has this many ticks
+_READ_S = 0.001  # time until the second look: an event loop reads its sockets before it waits for a timer
+_STOPPED_S = 1.0  # a tick this late was not delayed by work: the process was stopped, swapped out or frozen
 
 
 def max_silence_s(settings: SessionSettings) -> float:
-    """Return how long a robot may send nothing: its ping interval, and the time a ping may take."""
+    """Return how long a robot may send nothing, in seconds: ping interval and ping timeout together."""
     return settings.ping_interval_s + settings.ping_timeout_s
 
 
@@ -43,9 +42,9 @@ class IdleTimeouts:
         return self._next_s - now
 
     def close_idle(self, connections: Iterable[RobotConnection], now: float) -> None:
-        """Close the connections that are idle at *now*, s; call it at each tick.
+        """Close the connections that are idle at *now* (s); call this at each tick.
 
-        A connection that seems idle is closed only at the next tick, after the sockets were read once more.
+        A connection that seems idle is closed at the next tick, after its socket was read once more.
         """
         late_s = now - self._next_s
         suspects: set[RobotConnection] = set()

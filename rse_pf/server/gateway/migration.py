@@ -1,7 +1,7 @@
-"""Ask some of a crowded server's robots to move to another server, spread over time.
+"""Ask some robots of a loaded server to move to another server, spread over time.
 
-`plan` says when each worker asks its next robot; `Migration` does it in a worker.  No more robots are asked
-in a second than the settings allow, and no robot is asked again while it still has time to move.
+`plan` decides in the supervisor when each worker asks its next robot; `Migration` asks them in the worker.
+At most ``moves_per_s`` robots are asked in a second, and no robot is asked again while it has time to move.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ def plan(
 
     Args:
         loads: Robots of each worker.
-        robots: How many shall move; at most all are asked.
-        spread_s: Time the whole migration takes, longer if *moves_per_s* demands it.
-        moves_per_s: Slots in a second, at most.
+        robots: How many robots are asked; at most all are.
+        spread_s: Duration of the migration in seconds; longer if *moves_per_s* requires it.
+        moves_per_s: Greatest number of robots asked in a second.
         random: Uniform numbers in ``[0, 1)``.
     """
     remaining = list(loads)

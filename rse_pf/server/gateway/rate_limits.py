@@ -1,7 +1,19 @@
-"""Limit the messages of each robot, and the handshakes of each address.
+"""Limit the messages of each robot, and the handshakes of each address, by token buckets.
 
-Times and names go in, decisions come out.  The memory is bounded whatever strangers send, and a robot that
-keeps to its rate is never refused.
+A robot has one bucket for all of its sockets of one worker: ``session.max_commands_per_s`` tokens a second,
+and at most `command_burst` tokens.  Each message takes one.  A message that finds the bucket empty is refused
+with the time until the next token.  A robot that goes on regardless is disconnected and banned:
+
+1. `command_burst` refusals are one violation.
+2. `_MAX_VIOLATIONS` violations within `_VIOLATIONS_WINDOW_S` end the connection with close code 4429.
+3. Handshakes of that robot are refused for `RATE_BAN_S`.
+
+A robot that keeps to its rate is never refused, and one a little above it gets refusals only.  An address has
+a bucket for its handshakes.  Times and names go in, decisions come out, and memory is bounded whatever
+unauthenticated clients send.
+
+Source:
+    Turner 1986, "New directions in communications" (token bucket).
 """
 
 from __future__ import annotations
@@ -21,20 +33,17 @@ from rse_pf.wire.rate_limit import command_burst
 __all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RATE_BAN_S", "RobotRates", "SourceRates"]
 
 CUT_OFF = math.inf
-"""The robot ignores refusals, so that its connection ends: it may not try again at all."""
+"""Returned instead of a time to wait: the robot ignores refusals, so its connection is to be closed."""
 
-# A robot that was disconnected for its rate is refused for this long.
-RATE_BAN_S = 5.0
-HANDSHAKE_BURST = 1000.0
-"""Sockets or handshakes above their rate that are accepted at once: a fleet that comes back."""
-_MAX_NAMES = 20000
-"""Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
-_MIN_RETRY_MS = 1.0  # a refused robot waits at least this long, in ms
+RATE_BAN_S = 5.0  # handshakes of a disconnected robot are refused: otherwise it would resume at once
+HANDSHAKE_BURST = 1000.0  # sockets or handshakes accepted at once above the rate: a fleet that reconnects
+_MAX_NAMES = 20000  # robots or addresses remembered; those whose buckets are full are forgotten first
+_MIN_RETRY_MS = 1.0  # shortest pause that a refused robot is given; 0 would accept its message
+_MAX_VIOLATIONS = 3  # one violation may be a burst that was sent before its first refusal arrived
+_VIOLATIONS_WINDOW_S = 10.0  # violations that lie further apart do not count together
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
-_MAX_VIOLATIONS, _VIOLATIONS_WINDOW_S = 3, 10.0
-"""A violation is `command_burst` refusals; so many within the window close the socket with 4429."""
 
 
 @dataclass(slots=True)
@@ -46,11 +55,7 @@ class _Robot:
 
 
 class RobotRates:
-    """The rate of each robot, over all of its sockets of one worker.
-
-    A violation is `command_burst` refusals: a robot a little above its rate gets refusals only, one
-    far above it is cut off within a second and banned for `RATE_BAN_S`.
-    """
+    """The token buckets, violations and bans of the robots of one worker."""
 
     def __init__(self, limits: SessionSettings, *, max_names: int = _MAX_NAMES) -> None:
         """Remember no robot yet, and never more than *max_names*."""
@@ -63,9 +68,11 @@ class RobotRates:
         return len(self._robots)
 
     def retry_after_ms(self, robot: RobotId, now: float) -> float:
-        """Take one more message of *robot* and return 0, or return when it may try again.
+        """Take one token for a message of *robot* at *now* (s).
 
-        `CUT_OFF` ends the connection.  *now* is in seconds.
+        Returns:
+            0 if the message is accepted, else the milliseconds until the next token, or `CUT_OFF` if the
+            connection is to be closed.
         """
         if self._limits.max_commands_per_s <= 0:
             return 0.0
@@ -80,12 +87,12 @@ class RobotRates:
         return max(_MIN_RETRY_MS, wait_s * 1e3)
 
     def ban(self, robot: RobotId, now: float, seconds: float | None = None) -> None:
-        """Refuse the handshakes of *robot*, cut off at *now* (s), for *seconds* or `RATE_BAN_S`."""
+        """Refuse the handshakes of *robot* from *now* (s) for *seconds*, or for `RATE_BAN_S`."""
         known = self._robots.get(robot) or self._add(robot, now)
         known.banned_until = now + (RATE_BAN_S if seconds is None else seconds)
 
     def banned_s(self, robot: RobotId, now: float) -> float:
-        """Return for how many seconds more *robot* is banned, 0 if it is not."""
+        """Return how many seconds of the ban of *robot* are left, 0 without a ban."""
         known = self._robots.get(robot)
         return 0.0 if known is None else max(0.0, known.banned_until - now)
 
@@ -113,7 +120,7 @@ class RobotRates:
 
 
 class SourceRates:
-    """The rate of handshakes of each address; judged before any token is read."""
+    """The token buckets of the addresses that send handshakes; checked before any token is read."""
 
     def __init__(self, serving: ServingSettings, *, max_names: int = _MAX_NAMES) -> None:
         """Remember no address yet, and never more than *max_names*."""

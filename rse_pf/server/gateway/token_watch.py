@@ -1,6 +1,6 @@
-"""End a worker's connections when their token expires, is revoked, or belongs to a newer connection.
+"""Close the connections of a worker whose token expires, is revoked, or is used by a newer connection.
 
-A robot learns no reason beyond the close code.  Keys that cannot be read leave everything as it was known.
+A robot gets no reason beyond the close code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["TokenWatch"]
 
 
 class TokenWatch:
-    """The tokens of one worker's connections; the dispatcher tells which connections begin and end."""
+    """The tokens of the connections of one worker; the dispatcher calls `watch` and `forget`."""
 
     def __init__(
         self,
@@ -36,9 +36,9 @@ class TokenWatch:
         Args:
             context: The clocks, event loop, log and metrics of the worker.
             connections: The live connections of this worker; the dispatcher adds and removes them.
-            handshake: Judges fresh tokens, and gets new keys.
-            tell: Sends a message to the supervisor.
-            recorder: Records fresh tokens, and connections that are ended.
+            handshake: Verifies fresh tokens, and gets new keys.
+            tell: Sends an event to the supervisor.
+            recorder: Records fresh tokens, and connections that are closed, for the audit log.
         """
         self.connections = connections
         self._handshake = handshake
@@ -50,7 +50,7 @@ class TokenWatch:
         self._stays: dict[RobotConnection, TimerHandle] = {}
 
     def trust(self, keys: KeySet) -> None:
-        """Verify tokens with *keys* from now on, and end every connection whose token they do not allow.
+        """Verify tokens with *keys* from now on, and close every connection whose token they do not allow.
 
         Open connections of enrolled robots take the scopes and quotas of the present roster.
         """
@@ -89,7 +89,10 @@ class TokenWatch:
             self._report("left", connection)
 
     def replace(self, number: int) -> None:
-        """End the connection *number*, because the robot has a newer one; one that moves may finish first."""
+        """Close the connection *number*, because its robot has a newer one.
+
+        A connection that was asked to move is closed when its time to move is over.
+        """
         connection = self._by_number.get(number)
         if connection is None or connection.is_closing:
             return
@@ -101,7 +104,8 @@ class TokenWatch:
         connection.close(CLOSE_REPLACED, "replaced")
 
     def renew(self, connection: RobotConnection, token: str) -> None:
-        """Judge a fresh token of a live connection, and move the connection's end or leave it."""
+        """Verify a fresh token of a live connection; if it is valid, the connection lasts until it
+        expires."""
         before, clocks = connection.claims, self._context.clocks
         now, wall_s = clocks.monotonic(), clocks.wall()
         claims = self._handshake.claims_or_problem(token, wall_s)

@@ -36,8 +36,8 @@ from rse_pf.server.gateway.handshake import (
     banned_rejection,
 )
 from rse_pf.server.gateway.rate_limits import SourceRates
-from rse_pf.server.gateway.socket_poller import SocketPoller
 from rse_pf.server.scheduling.deferred_work import DeferredWork
+from rse_pf.server.scheduling.socket_poller import SocketPoller
 
 picows: Any = _picows  # its stubs lack what is used here
 

@@ -1,8 +1,8 @@
-"""Emulate a server with fewer cores: a bucket of CPU seconds delays the start of commands.
+"""Emulate a server with fewer cores: a token bucket of CPU seconds delays the start of commands.
 
-A server of ``serving.emulated_cores`` may use that many CPU seconds per second.  The bucket is drained by
-what the process really used, so the emulation holds whatever the work was.  Nothing here sleeps: the caller
-asks, and sets a timer for the time it is told.
+The bucket gets ``serving.emulated_cores`` CPU seconds per second, and loses the CPU seconds that the process
+used, whatever for.  A command starts while the bucket is not below zero.  Nothing here sleeps: the caller
+sets a timer for the returned time.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from collections.abc import Callable
 
 __all__ = ["MIN_WAIT_S", "CpuThrottle"]
 
-MIN_WAIT_S = 0.002
-"""Measured: with shorter waits, the waiting itself used up the budget of a small server."""
-_BURST_S = 0.02
+MIN_WAIT_S = 0.002  # shorter waits cost as much CPU time as a small server may use
+_BURST_S = 0.02  # CPU seconds that may be used at once: some solves, so that a single command is not delayed
 
 
 class CpuThrottle:

@@ -1,6 +1,7 @@
-"""Do the work of strangers in small parts, so that robots' frames are served in between.
+"""Do the work for unauthenticated clients in small steps, so that robots are served in between.
 
-A step is a call that takes well under a millisecond.  The time is an argument; nothing here knows a socket.
+A step is a call that takes well under a millisecond.  The clock is an argument, and nothing here uses a
+socket.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ class DeferredWork:
         Args:
             loop: Runs the steps.
             clock: Seconds, monotonic.
-            bound_s: No further step begins in a round of *loop* once its steps have taken so long.
+            bound_s: No further step begins in a round of *loop* after its steps have taken this long.
         """
         self._loop = loop
         self._clock = clock
@@ -55,6 +56,6 @@ class DeferredWork:
                 if self._clock() >= until:
                     break
         finally:
-            # A step that fails is the event loop's to report, and the others go on.
+            # The event loop reports a step that raises, and the other steps run in the next round.
             self._is_planned = False
             self._plan()

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 from picows import picows
 
-from rse_pf.server.gateway.socket_poller import SocketPoller
 from rse_pf.server.gateway.websocket import Listener, RobotProtocol
+from rse_pf.server.scheduling.socket_poller import SocketPoller
 from tests.kit.fakes import FakeLoop
 
 

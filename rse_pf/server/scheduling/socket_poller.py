@@ -1,7 +1,8 @@
-"""Which of the robots' sockets are readable, for a bounded time in each round of the event loop.
+"""Read the sockets of robots for a bounded time in each round of the event loop.
 
-libuv polls up to 48 times within one round while 1024 sockets are readable each time: a worker that once fell
-so far behind read for up to 3.9 s without looking at its timers.  So its sockets have an own epoll object.
+libuv polls up to 48 times within one round while 1024 sockets are readable each time.  A worker that had
+fallen that far behind read for up to 3.9 s without running its timers.  The sockets of robots therefore have
+an epoll object of their own, which the event loop polls as one descriptor.
 """
 
 from __future__ import annotations
@@ -13,11 +14,10 @@ from typing import Any
 
 __all__ = ["SocketPoller"]
 
-_AT_ONCE = 64
-"""Sockets that are asked for together; the kernel passes first those that were not passed for longest."""
+_AT_ONCE = 64  # sockets of one poll; the kernel returns first those that it has not returned for longest
+# No further socket is read in a round of the event loop after reading has taken this long.  With 0.008,
+# frames of robots that ignore their pauses stayed in the kernel beyond their deadline.
 _BOUND_S = 0.03
-"""No further socket is read in a round of the event loop once reading has taken so long.  With 0.008, frames
-of robots that ignore their pauses stayed in the kernel until it was too late."""
 
 
 class SocketPoller:
@@ -45,7 +45,7 @@ class SocketPoller:
         self._leaves_unread = False
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the event loop does itself: all but reading."""
+        """Return a method of the event loop, for everything but reading."""
         return getattr(self._loop, name)
 
     def add_reader(self, fd: int, callback: Callable[[], Any]) -> None:
@@ -69,7 +69,7 @@ class SocketPoller:
         return self._leaves_unread
 
     def end_turn(self, read_on: Callable[[], None]) -> None:
-        """Call *read_on* once the present callback has returned: its socket is readable behind the others."""
+        """Call *read_on* after the present callback has returned, so that its socket is read after others."""
         self._turns_over.append(read_on)
 
     def _read(self) -> None:

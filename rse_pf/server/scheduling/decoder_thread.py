@@ -1,9 +1,9 @@
-"""Decode long messages in a thread of their own, so that a decompression bomb delays its sender only.
+"""Decode long messages in a thread of their own, so that a decompression bomb delays only its sender.
 
-The event loop decodes short messages, such as the commands of robots that solve poses.  What is long, or
-inflates to much, waits here, behind all others if its robot sent undecodable messages before.  The messages
-of one robot keep their order, because `RobotConnection` defers what arrives while one of its messages is
-here.
+The event loop decodes short messages, such as commands for poses.  A message that is long, or inflates to
+more than `_MAX_INLINE_RATIO` times `INLINE_BYTES`, waits here.  Messages of robots that sent undecodable
+messages before are decoded last.  The messages of one robot keep their order, because `RobotConnection`
+defers what arrives while one of its messages is decoded here.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from rse_pf.wire.messages import FromRobot
 
 __all__ = ["DecoderThread"]
 
+# A message that is decoded in the event loop may inflate to this many times `INLINE_BYTES`; numbers in JSON
+# inflate to two or three times their compressed size.
 _MAX_INLINE_RATIO = 4
-"""A message that is decoded in the event loop may inflate to this many times `INLINE_BYTES`; JSON of numbers
-inflates to two or three times its size."""
 
 Done = Callable[[FromRobot | ProtocolError], None]
 
@@ -62,10 +62,10 @@ class DecoderThread:
 
         Args:
             codec: The codec of the robot.
-            data: One whole message, which `Admission.may_wait` let pass.
-            number: Of the connection of the robot.
-            suspicion: `ServerSession.suspicion` of the robot; robots with less come first.
-            done: Takes the message, or why it is none.
+            data: One whole message, which `Admission.may_wait` admitted.
+            number: Number of the connection.
+            suspicion: `ServerSession.suspicion` of the robot; messages with a smaller one are decoded first.
+            done: Gets the message, or the error of decoding it.
         """
         with self._changed:
             self.unread_bytes += len(data)

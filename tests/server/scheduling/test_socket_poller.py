@@ -10,7 +10,7 @@ from functools import partial
 
 import uvloop
 
-from rse_pf.server.gateway.socket_poller import SocketPoller
+from rse_pf.server.scheduling.socket_poller import SocketPoller
 
 SOCKETS = 200
 CLOCK_STEP_S = 0.00075
