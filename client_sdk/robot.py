@@ -12,7 +12,6 @@ import ssl
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -32,9 +31,11 @@ from client_sdk.offloading.burst_policy import check_burst_url
 from client_sdk.offloading.command_router import CallArguments, CommandRouter, OnProgress
 from client_sdk.offloading.local_services import LocalServices
 from client_sdk.offloading.offload_policy import CloudFirst
+from client_sdk.recording import make_robot_recorder
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, Unauthorized, UsageError, error_from_code
+from rse_pf.version import installed_version
 from rse_pf.wire import CODECS, Failure, Welcome, as_type, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
     from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction
     from client_sdk.point_map import MapOptions
     from client_sdk.tracking.monocular_tracker import MonocularOptions
-    from rse_pf.extensions.recording.robot_recorder import RobotRecorder
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
 
@@ -131,9 +131,11 @@ class Robot:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
         settings, random = settings or SessionSettings(), random or random_module.Random()
         self._session = ClientSession(
-            codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{_sdk_version()}"
+            codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{installed_version()}"
         )
-        self._recorder = None if record is None else _make_recorder(record, thumbnails, settings)
+        self._recorder = make_robot_recorder(
+            record, thumbnails=thumbnails, session=settings, version=installed_version()
+        )
         self.callbacks = UserCallbacks(settings.ping_timeout_s)
         self._connection = Connection(
             urls,
@@ -194,8 +196,7 @@ class Robot:
             UsageError: The enrolment file cannot be used.
         """
         try:
-            if self._recorder is not None:
-                self._recorder.start()
+            self._recorder.start()
             if self._enrolment is not None:
                 access = read_enrolment(self._enrolment)
                 urls = self._urls if self._urls != [""] else [access.url]
@@ -241,8 +242,7 @@ class Robot:
             self._data_client.close()
         if self._local is not None:
             self._local.close()
-        if self._recorder is not None:
-            await asyncio.to_thread(self._recorder.stop)
+        await self._recorder.stop()
 
     async def solve_pnp(
         self,
@@ -473,8 +473,7 @@ class Robot:
             frame: Image and time.
             T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame, metres; None records no pose.
         """
-        if self._recorder is not None:
-            self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)
+        self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)
 
     @property
     def connected(self) -> bool:
@@ -617,22 +616,6 @@ class Robot:
             self._subscriptions.handle_event(event)
             return
         self._router.handle_event(event)
-
-
-def _make_recorder(folder: str | Path, thumbnails: bool, settings: SessionSettings) -> RobotRecorder:
-    from rse_pf.extensions.recording.robot_recorder import (
-        RobotRecorder,  # robots that do not record need no mcap
-    )
-
-    return RobotRecorder(folder, thumbnails=thumbnails, session=settings, version=_sdk_version())
-
-
-def _sdk_version() -> str:
-    """Return the version of this SDK, "0" where it runs from its sources without an installation."""
-    try:
-        return metadata.version("rse-pf")
-    except metadata.PackageNotFoundError:
-        return "0"
 
 
 connect = Robot

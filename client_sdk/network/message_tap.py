@@ -14,7 +14,7 @@ class MessageTap(Protocol):
     """Observe the messages of all connections of one robot.
 
     `client_sdk.network.connection` calls the methods in its event loop, so they must return at once and
-    raise nothing.  `rse_pf.extensions.recording.robot_recorder.RobotRecorder` implements this protocol.
+    raise nothing.
     """
 
     def open_connection(self, codec: Codec, token: str | None) -> int:

@@ -124,7 +124,9 @@ def _run(words: list[str]) -> int:
         show_page(_front_page())
         return _EXIT_OK
     if words[0] == "--version":
-        show(f"rse-pf {_version()}")
+        from rse_pf.version import installed_version
+
+        show(f"rse-pf {installed_version()}")
         return _EXIT_OK
     name, *rest = words
     if name.startswith("-"):
@@ -167,15 +169,6 @@ def _front_page() -> str:
         "rse-pf VERB --help explains a verb; rse-pf --version names the version.\n\n"
         "example:\n  rse-pf demo --out out"
     )
-
-
-def _version() -> str:
-    from importlib import metadata
-
-    try:
-        return metadata.version("rse-pf")
-    except metadata.PackageNotFoundError:
-        return "(not installed)"
 
 
 def _missing_extra(error: ModuleNotFoundError) -> RsePfError:

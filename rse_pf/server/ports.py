@@ -11,13 +11,16 @@ from typing import Any, Protocol
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
-from rse_pf.extensions.recording.tap import RecordingTap
 from rse_pf.identity import RobotId
 from rse_pf.server.log import JsonLog
 from rse_pf.server.metrics import Metrics
+from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.server_session import ServerSession
 
-__all__ = ["Clocks", "CrashMarks", "Log", "NoCrashMarks", "Subscriber", "Wire", "WorkerContext"]
+__all__ = [
+    "Clocks", "CrashMarks", "Log", "MessageTap", "NoCrashMarks", "NullMessageTap", "NullServerRecorder",
+    "ServerRecorder", "Subscriber", "Wire", "WorkerContext",
+]  # fmt: skip
 
 
 class Wire(Protocol):
@@ -76,6 +79,111 @@ class NoCrashMarks:
     def compute_for(self, number: int) -> int:
         """Note nothing."""
         return 0
+
+
+class MessageTap(Protocol):
+    """Observe the messages of all connections of one worker.
+
+    The event loop of the worker calls the methods for every message, so they must return at once and raise
+    nothing.
+    """
+
+    dropped: int
+    """Messages that could not be recorded."""
+
+    def open_connection(self, codec: str, robot: RobotId) -> int:
+        """Return a number that identifies a new connection in later calls; *codec* is the codec's name."""
+
+    def observe_received(self, connection: int, data: bytes) -> None:
+        """Observe the bytes of a message from the robot, before they are decoded."""
+
+    def observe_command(self, data: bytes, command: Command) -> None:
+        """Observe the command that *data*, the message that was received last, was decoded to."""
+
+    def observe_sent(self, connection: int, data: bytes) -> None:
+        """Observe the bytes of a message to the robot."""
+
+    def observe_answer(self, data: bytes, command: Command, answer: Result | Failure) -> None:
+        """Observe which *answer* to which command *data*, the message that was sent last, holds."""
+
+    def close_connection(self, connection: int) -> None:
+        """Observe that *connection* has ended."""
+
+    def flush(self) -> None:
+        """Pass on what was observed; the worker exits."""
+
+
+class NullMessageTap:
+    """Ignore all messages: the tap of a server that records nothing."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+
+    def open_connection(self, codec: str, robot: RobotId) -> int:
+        """Return 0 for every connection."""
+        return 0
+
+    def observe_received(self, connection: int, data: bytes) -> None:
+        """Ignore a message."""
+
+    def observe_command(self, data: bytes, command: Command) -> None:
+        """Ignore a command."""
+
+    def observe_sent(self, connection: int, data: bytes) -> None:
+        """Ignore a message."""
+
+    def observe_answer(self, data: bytes, command: Command, answer: Result | Failure) -> None:
+        """Ignore an answer."""
+
+    def close_connection(self, connection: int) -> None:
+        """Ignore the end of a connection."""
+
+    def flush(self) -> None:
+        """Do nothing."""
+
+
+class ServerRecorder(Protocol):
+    """Record the messages of one server; the supervisor enters it before it forks the workers."""
+
+    pids: list[int]
+    """The processes of the recorder."""
+
+    def __enter__(self) -> object:
+        """Start to record."""
+
+    def __exit__(self, *_: object) -> None:
+        """Finish the recording; all workers have exited."""
+
+    def open_tap(self, call_later: Callable[[float, Callable[[], None]], object], log: Log) -> MessageTap:
+        """Return the tap of a worker, which calls this after it was forked.
+
+        Args:
+            call_later: Of the event loop of the worker.
+            log: The log of the worker.
+        """
+
+    def leave_to_workers(self) -> None:
+        """Note that all workers are forked, so that only they keep the recording open."""
+
+
+class NullServerRecorder:
+    """Record nothing."""
+
+    def __init__(self) -> None:
+        self.pids: list[int] = []
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing."""
+
+    def open_tap(self, call_later: Callable[[float, Callable[[], None]], object], log: Log) -> MessageTap:
+        """Return a tap that ignores all messages."""
+        return NullMessageTap()
+
+    def leave_to_workers(self) -> None:
+        """Do nothing."""
 
 
 class Subscriber(Protocol):
@@ -141,7 +249,7 @@ class WorkerContext:
         loop: The event loop of the worker.
         log: The log of the worker.
         metrics: The counters of the worker.
-        tap: Takes the messages of all connections for a recording; None where nothing is recorded.
+        tap: Observes the messages of all connections, for a recording.
         crash: Knows for whom this process computes, if it crashes.
         new_session_id: Makes the id of a session, which goes into its welcome.
     """
@@ -152,6 +260,6 @@ class WorkerContext:
     loop: AbstractEventLoop
     log: JsonLog
     metrics: Metrics = field(default_factory=Metrics)
-    tap: RecordingTap | None = None
+    tap: MessageTap = field(default_factory=NullMessageTap)
     crash: CrashMarks = field(default_factory=NoCrashMarks)
     new_session_id: Callable[[], str] = make_session_id

@@ -109,13 +109,17 @@ def test_a_name_in_a_free_text_becomes_a_pseudonym(codec: str, message: Any):
 def test_a_welcome_names_the_pseudonym_and_a_refusal_no_robot(codec: str):
     judge, codec_ = redactor(codec), make_codec(codec)
     limits = Limits(max_message_bytes=1, max_in_flight=1)
-    welcome = Welcome(server="s", session="x", robot="müller-7", protocol=1, limits=limits, clock_s=1.0)
+    welcome = Welcome(
+        server="s", session="x", robot="müller-7", protocol=1, limits=limits, clock_s=1.0,
+        tenant="acme", scopes=("maps:kitchen",),
+    )  # fmt: skip
 
     kept = judge.down(codec_.encode(welcome))
     refusal = judge.down(codec_.encode(Failure(code="busy", message="robot müller-7 is too fast")))
 
     assert kept is not None
-    assert codec_.decode_from_server(kept.data).robot == judge.robot
+    stored = codec_.decode_from_server(kept.data)
+    assert (stored.robot, stored.tenant, stored.scopes) == (judge.robot, judge.tenant, ())
     assert refusal is not None
     assert judge.robot in codec_.decode_from_server(refusal.data).message
 

@@ -13,9 +13,9 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.recording.recorder_process import RecorderPlan
+from rse_pf.extensions.recording.server_recorder import FileServerRecorder
 from rse_pf.extensions.recording.tap import LOST, OPENED, UP, Handed, PipeReader, RecordingTap, hand_pipe
 from rse_pf.identity import RobotId
-from rse_pf.server.supervisor.server_recording import ServerRecording
 
 ROBOT = RobotId("default", "robot-1")
 _DEADLINE_S = 10.0
@@ -61,9 +61,9 @@ class FakeRecorders:
             return self.processes[count - 1]
 
 
-def recording(folder: Path, recorders: FakeRecorders) -> ServerRecording:
+def recording(folder: Path, recorders: FakeRecorders) -> FileServerRecorder:
     settings = PlatformSettings().replace(recording={"folder": str(folder)})
-    return ServerRecording(settings, "server-1", start=recorders.start, restart_s=0.0, clock=lambda: 1.0)
+    return FileServerRecorder(settings, "server-1", start=recorders.start, restart_s=0.0, clock=lambda: 1.0)
 
 
 def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key(
@@ -74,7 +74,7 @@ def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key
     with recording(tmp_path, recorders) as recorded:
         assert recorded.to_recorder is not None
         worker = os.dup(recorded.to_recorder)
-        recorded.hand_over()
+        recorded.leave_to_workers()
         for count in range(1, 7):
             recorders.wait_for(count).end(-9)
         watching = next(each for each in threading.enumerate() if each.name == "recorder")
@@ -94,20 +94,10 @@ def test_a_recorder_that_ended_because_the_workers_are_gone_is_not_started_again
     recorders = FakeRecorders()
 
     with recording(tmp_path, recorders) as recorded:
-        recorded.hand_over()
+        recorded.leave_to_workers()
         recorders.wait_for(1).end(0)
 
     assert len(recorders.plans) == 1
-
-
-def test_without_a_folder_nothing_is_started():
-    recorders = FakeRecorders()
-
-    with ServerRecording(PlatformSettings(), "server-1", start=recorders.start) as recorded:
-        recorded.hand_over()
-
-    assert recorders.plans == []
-    assert recorded.to_recorder is None
 
 
 def entries(end: int) -> list[Handed]:
@@ -122,17 +112,17 @@ def test_the_next_recorder_learns_of_open_connections_and_gets_what_waited():
     tap = RecordingTap(
         first, call_later=lambda seconds, call: due.append(call), renew=lambda: hand_pipe(theirs.fileno())
     )
-    kept, gone = tap.opened("bin", ROBOT), tap.opened("zlib", ROBOT)
+    kept, gone = tap.open_connection("bin", ROBOT), tap.open_connection("zlib", ROBOT)
     _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
     due.pop()()
     assert [each.kind for each in entries(end)] == [OPENED, OPENED]
-    tap.closed(gone)
-    tap.up(kept, b"asks")
+    tap.close_connection(gone)
+    tap.observe_received(kept, b"asks")
     os.close(end)
 
     due.pop()()  # finds that nobody reads, and has another pipe
-    tap.up(kept, b"asks again")
-    late = tap.opened("bin", ROBOT)
+    tap.observe_received(kept, b"asks again")
+    late = tap.open_connection("bin", ROBOT)
     due.pop()()
 
     _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
@@ -144,7 +134,7 @@ def test_the_next_recorder_learns_of_open_connections_and_gets_what_waited():
     assert found[1].data == b"asks again"
     assert tap.dropped == 1
     assert not tap.is_dead
-    tap.hand_over()
+    tap.flush()
     os.close(end)
     theirs.close()
     ours.close()
@@ -157,12 +147,12 @@ def test_what_waits_for_the_next_recorder_stays_within_its_bound():
         hand_pipe(theirs.fileno()) or -1, call_later=lambda seconds, call: due.append(call),
         renew=lambda: hand_pipe(theirs.fileno()),
     )  # fmt: skip
-    number = tap.opened("bin", ROBOT)
+    number = tap.open_connection("bin", ROBOT)
     _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
     os.close(end)
 
     for _ in range(200):
-        tap.up(number, bytes(100_000))
+        tap.observe_received(number, bytes(100_000))
         if due:
             due.pop()()
 

@@ -108,7 +108,7 @@ def test_a_map_that_the_robot_saves_is_a_point_cloud_in_the_file(tmp_path: Path)
     recorder.start()
 
     recorder.record_map(np.arange(600_000, dtype=np.float32).reshape(-1, 3))
-    recorder.stop()
+    asyncio.run(recorder.stop())
 
     (cloud,) = (json.loads(each) for each in topics(tmp_path)["map"])
     found = np.frombuffer(base64.b64decode(cloud["data"]), "<f4").reshape(-1, 3)
@@ -146,6 +146,6 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path)
     for _ in range(5000):
         recorder.observe_message(1, "up", b"")
     recorder._queue.maxsize = 10
-    recorder.stop()
+    asyncio.run(recorder.stop())
 
     assert recorder.dropped > 0

@@ -66,10 +66,10 @@ def test_all_entries_arrive_in_order_with_their_times(pipe: tuple[int, int]):
     loop, times = Loop(), iter(range(100))
     tap = RecordingTap(pipe[1], call_later=loop.call_later, time_ns=lambda: next(times))
 
-    number = tap.opened("bin", ROBOT)
-    tap.up(number, b"asks")
-    tap.down(number, b"")
-    tap.closed(number)
+    number = tap.open_connection("bin", ROBOT)
+    tap.observe_received(number, b"asks")
+    tap.observe_sent(number, b"")
+    tap.close_connection(number)
     assert len(loop.due) == 1
     loop.turn()
 
@@ -84,10 +84,10 @@ def test_all_entries_arrive_in_order_with_their_times(pipe: tuple[int, int]):
 def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[int, int]):
     loop = Loop()
     tap = RecordingTap(pipe[1], call_later=loop.call_later)
-    number = tap.opened("bin", ROBOT)
+    number = tap.open_connection("bin", ROBOT)
 
     for _ in range(150):
-        tap.up(number, bytes(100_000))
+        tap.observe_received(number, bytes(100_000))
         loop.turn()
     assert 0 < tap.dropped < 150
     reader, found = PipeReader(), list[Handed]()
@@ -103,13 +103,13 @@ def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[in
 def test_a_recorder_that_died_is_told_once_and_everything_goes_on(pipe: tuple[int, int]):
     loop, told = Loop(), list[str]()
     tap = RecordingTap(pipe[1], call_later=loop.call_later, on_dead=lambda: told.append("dead"))
-    number = tap.opened("bin", ROBOT)
-    tap.up(number, b"x")
+    number = tap.open_connection("bin", ROBOT)
+    tap.observe_received(number, b"x")
     os.close(pipe[0])
 
     loop.turn()
     for _ in range(3):
-        tap.down(number, b"x")
+        tap.observe_sent(number, b"x")
         loop.turn()
 
     assert told == ["dead"]

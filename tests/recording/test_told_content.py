@@ -29,7 +29,7 @@ from rse_pf.identity import RobotId
 from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry
 from rse_pf.services import pnp
-from rse_pf.wire import CODECS, Command, Ping, make_codec
+from rse_pf.wire import CODECS, Command, Ping, Result, make_codec
 from tests.kit.worker_parts import worker_parts
 
 ROBOT = RobotId("default", "robot-seven")
@@ -64,7 +64,7 @@ def handed(pipe: tuple[int, int], codec: str, *messages: Any) -> list[Handed]:
         connection, _ = worker.join(ROBOT.name)
         for message in messages:
             worker.say(connection, message)
-        tap.hand_over()
+        tap.flush()
     return list(PipeReader().entries(os.read(pipe[0], 1 << 20)))
 
 
@@ -141,16 +141,16 @@ def test_the_pose_of_a_command_that_was_left_out_is_left_out():
 
 def test_only_the_newest_message_of_a_tap_can_be_told(pipe: tuple[int, int]):
     tap = RecordingTap(pipe[1], call_later=lambda seconds, call: None)
-    number = tap.opened("bin", ROBOT)
+    number = tap.open_connection("bin", ROBOT)
     first, second = b"first", b"second"
-    tap.up(number, first)
-    tap.up(number, second)
+    tap.observe_received(number, first)
+    tap.observe_received(number, second)
 
-    tap.is_plain(first, 1, "")
-    tap.has_pose(second, 1, b"too short")
-    tap.is_plain(second, 2, "x" * 300)
-    tap.hand_over()
-    tap.is_plain(second, 2, "")
+    tap.observe_command(first, command("bin"))
+    tap.observe_answer(second, command("bin"), Result(id=1, reply=None))
+    tap.observe_command(second, command("bin", trace="x" * 300))
+    tap.flush()
+    tap.observe_command(second, command("bin"))
 
     found = list(PipeReader().entries(os.read(pipe[0], 1 << 20)))
     assert [(each.kind, each.data) for each in found[1:]] == [(UP, first), (UP, second)]

@@ -381,6 +381,7 @@ async def _foreground(
     name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, extras: _Extras
 ) -> int:  # fmt: skip
     from rse_pf.cli.local_platform.page import page_beside, process_beside
+    from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
 
@@ -408,6 +409,7 @@ async def _foreground(
         control=ControlOptions(elastic=True),
         lan=lan,
         metrics_port=settings.local.metrics_port,
+        recorder=make_platform_recorder(settings, folder),
     )
     try:
         async with platform:

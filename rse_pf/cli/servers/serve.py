@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.auth.trust_store import TrustStore
@@ -20,6 +21,9 @@ from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import UsageError
 from rse_pf.extensions.recording.writer import with_recordings
+
+if TYPE_CHECKING:
+    from rse_pf.server.ports import ServerRecorder
 
 __all__ = ["add_arguments", "run"]
 
@@ -119,8 +123,16 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         conformance_echo=args.conformance_echo,
         audit=args.audit,
         control_token=token,
-        recording_key=args.record_key,
+        recorder=_recorder(chosen, server_id, args.record_key),
     )
+
+
+def _recorder(settings: PlatformSettings, server_id: str, key: Path | None) -> ServerRecorder | None:
+    if not settings.recording.folder:
+        return None
+    from rse_pf.extensions.recording.server_recorder import FileServerRecorder
+
+    return FileServerRecorder(settings, server_id, key)
 
 
 def _given(args: argparse.Namespace, options: dict[str, type]) -> dict[str, object]:

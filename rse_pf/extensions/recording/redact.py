@@ -271,7 +271,11 @@ class ConnectionRedactor:
         message = self._codec.decode_from_server(data)
         if not isinstance(message, Welcome):
             return None
-        changed = self._codec.encode(msgspec.structs.replace(message, robot=self.robot))
+        # Scopes may name maps and services of the tenant.
+        tenant = None if message.tenant is None else self.tenant
+        changed = self._codec.encode(
+            msgspec.structs.replace(message, robot=self.robot, tenant=tenant, scopes=())
+        )
         return Kept(changed, self._inflate(changed), "welcome", "")
 
 

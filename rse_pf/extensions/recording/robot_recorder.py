@@ -6,6 +6,7 @@ are dropped and counted, so a slow or full disk costs the recording and never a 
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import importlib.util
 import json
@@ -102,7 +103,7 @@ class _Connection:
 
 
 class RobotRecorder:
-    """Record the messages, frames and maps of one robot between `start` and `stop`; a `MessageTap`."""
+    """Record one robot into files; implements `client_sdk.recording.RobotRecorder`."""
 
     def __init__(
         self, folder: str | Path, *, thumbnails: bool, session: SessionSettings, version: str = ""
@@ -141,12 +142,15 @@ class RobotRecorder:
         self._thread = threading.Thread(target=self._run, args=(folder,), name="recorder", daemon=True)
         self._thread.start()
 
-    def stop(self) -> None:
+    async def stop(self) -> None:
         """Write the queued entries and finish the file, within five seconds."""
         thread, self._thread = self._thread, None
         if thread is not None:
-            self._queue.put(None)
-            thread.join(STOP_TIMEOUT_S)
+            await asyncio.to_thread(self._finish, thread)
+
+    def _finish(self, thread: threading.Thread) -> None:
+        self._queue.put(None)
+        thread.join(STOP_TIMEOUT_S)
 
     def open_connection(self, codec: Codec, token: str | None) -> int:
         """Return the number of a new connection; no message that holds *token* will be recorded."""

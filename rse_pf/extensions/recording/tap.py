@@ -16,7 +16,11 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import NamedTuple
 
+import msgspec
+import numpy as np
+
 from rse_pf.identity import RobotId
+from rse_pf.wire import Command, Failure, Result
 
 __all__ = [
     "CLOSED", "DOWN", "LOST", "OPENED", "PLAIN", "POSE", "UP", "Handed", "PipeReader", "RecordingTap",
@@ -74,7 +78,7 @@ def hand_pipe(to_recorder: int) -> int | None:
 
 
 class RecordingTap:
-    """Where the connections of a worker put their messages."""
+    """Pass the messages of a worker's connections to the recorder; a `rse_pf.server.ports.MessageTap`."""
 
     __slots__ = (
         "_call_later",
@@ -128,56 +132,55 @@ class RecordingTap:
         self._rest_messages = 0
         self._is_waiting = False
 
-    def opened(self, codec: str, robot: RobotId) -> int:
+    def open_connection(self, codec: str, robot: RobotId) -> int:
         """Return the number of a new connection, for the other calls."""
         self._connections += 1
         described = self._open[self._connections] = json.dumps([codec, *robot]).encode()
         self._append(OPENED, self._connections, described)
         return self._connections
 
-    def closed(self, connection: int) -> None:
-        """Take that *connection* is over."""
+    def close_connection(self, connection: int) -> None:
+        """Record that *connection* has ended."""
         self._open.pop(connection, None)
         self._append(CLOSED, connection, b"")
 
-    def up(self, connection: int, data: bytes) -> None:
-        """Take a message of the robot."""
+    def observe_received(self, connection: int, data: bytes) -> None:
+        """Record a message from the robot."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(UP, connection, data)
         else:
             self.dropped += 1
 
-    def is_plain(self, data: bytes, identity: int, words: str) -> None:
-        """Take what *data*, the message that was taken last, was read as, so that nobody inflates it again.
+    def observe_command(self, data: bytes, command: Command) -> None:
+        """Record what *data*, the message that was received last, was decoded to.
 
-        Args:
-            data: The same object.
-            identity: Of the `pnp` command that it is.
-            words: All its texts that the protocol does not fix; the rest of it is numbers in known fields.
+        The recorder then need not inflate it.  That is possible if the codec decoded the payload to a
+        structure, which it does only if it knows all fields; its only texts are ``stream`` and ``trace``.
         """
-        text = words.encode()
-        if len(text) <= _MAX_WORDS_BYTES:
-            self._tell(PLAIN, data, _PLAIN.pack(identity, len(text)) + text)
+        if isinstance(command.payload, msgspec.Struct):
+            text = f"{command.stream} {command.trace}".encode()
+            if len(text) <= _MAX_WORDS_BYTES:
+                self._describe_newest(PLAIN, data, _PLAIN.pack(command.id, len(text)) + text)
 
-    def down(self, connection: int, data: bytes) -> None:
-        """Take a message to the robot."""
+    def observe_sent(self, connection: int, data: bytes) -> None:
+        """Record a message to the robot."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(DOWN, connection, data)
         else:
             self.dropped += 1
 
-    def has_pose(self, data: bytes, identity: int, T_camera_world: bytes) -> None:
-        """Take what *data*, the message that was given last, says, so that nobody inflates it.
+    def observe_answer(self, data: bytes, command: Command, answer: Result | Failure) -> None:
+        """Record the pose in *data*, the message that was sent last, so that nobody inflates it again.
 
-        Args:
-            data: The same object; no text in it comes from a robot.
-            identity: Of the `pnp` command that it answers.
-            T_camera_world: 16 doubles, row-major.
+        Nothing is recorded if the answer has no pose, or may hold texts of the robot.
         """
-        if len(T_camera_world) == _POSE.size - 8:
-            self._tell(POSE, data, identity.to_bytes(8, "little") + T_camera_world)
+        if not isinstance(command.payload, msgspec.Struct) or not isinstance(answer, Result):
+            return
+        pose = getattr(answer.reply, "T_camera_world", None)
+        if isinstance(pose, np.ndarray) and pose.dtype == np.float64 and pose.size == 16:
+            self._describe_newest(POSE, data, answer.id.to_bytes(8, "little") + pose.tobytes())
 
-    def _tell(self, kind: int, data: bytes, head: bytes) -> None:
+    def _describe_newest(self, kind: int, data: bytes, head: bytes) -> None:
         """Put *head* before the newest entry, if that is *data*."""
         if not self._entries:
             return
@@ -186,7 +189,7 @@ class RecordingTap:
             self._entries[-1] = kind, connection, time_ns, head + data
             self._waiting_bytes += len(head)
 
-    def hand_over(self) -> None:
+    def flush(self) -> None:
         """Write what waits into the pipe, as much as it takes now."""
         self._is_waiting = False
         try:
@@ -217,7 +220,7 @@ class RecordingTap:
 
     def _wait(self, seconds: float = _HAND_OVER_S) -> None:
         self._is_waiting = True
-        self._call_later(seconds, self.hand_over)
+        self._call_later(seconds, self.flush)
 
     def _pack(self) -> bytes:
         """Return the next entries as they are in the pipe, a bounded copy of them."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import functools
 import os
 import secrets
@@ -31,7 +32,7 @@ from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.federation import service_discovery
 from rse_pf.local.control.fleet import Fleet, FleetReports, Member
 from rse_pf.local.control.operator_port import OperatorPort
-from rse_pf.local.control.platform_recording import PlatformRecording
+from rse_pf.local.control.platform_recorder import NullPlatformRecorder, PlatformRecorder
 from rse_pf.local.control.scale_modifier import bounds_for
 from rse_pf.local.control.settings_change import SettingsChange, settings_change
 from rse_pf.local.disk_watch import DiskWatch
@@ -98,6 +99,7 @@ class LocalPlatform:
         program: Sequence[str] = RSE_PF,
         lan: str = "",
         metrics_port: int = 0,
+        recorder: PlatformRecorder | None = None,
     ) -> None:
         """Describe a platform; nothing is started.
 
@@ -118,9 +120,13 @@ class LocalPlatform:
                 ``serving.host``, which is loopback.
             metrics_port: Port of the control plane on loopback: /metrics of all servers, /status; 0 takes a
                 free one, and so does a port that is taken, with the event ``metrics-port-taken``.
+            recorder: Records events, and samples of the monitor, which then runs in any case; None records
+                nothing.
         """
-        self._recording = PlatformRecording(settings, state.absolute())
-        control = self._recording.watching(control or ControlOptions())
+        control = control or ControlOptions()
+        if recorder is not None:
+            control = _with_sample_observer(control, recorder.record_sample)
+        self._recorder = recorder or NullPlatformRecorder()
         self.events: list[Event] = []
         self.url = ""
         self.name = name or state.name
@@ -480,7 +486,7 @@ class LocalPlatform:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
         self._write_settings(self.settings)
-        self._recording.begin()
+        self._recorder.begin()
         self._disks.prepare()
         self._control.start_checks()
         if previous is None:
@@ -671,7 +677,7 @@ class LocalPlatform:
                 if not self._adoptable:  # no one can adopt this platform: its tokens are worthless
                     key_file(self.state).unlink(missing_ok=True)
                     control_token_file(self.state).unlink(missing_ok=True)
-            self._recording.close()
+            self._recorder.close()
             self._audit.close()
             self._lock.release()
         await asyncio.sleep(0)  # the end of the audit log may have had something to report
@@ -688,7 +694,21 @@ class LocalPlatform:
         entry = {"event": event, **details}
         self.events.append(entry)
         self._audit.record(entry)
-        self._recording.event(entry)
+        self._recorder.record_event(entry)
         self._operator_port.take_event(entry)
         if self._on_event is not None:
             self._on_event(entry)
+
+
+def _with_sample_observer(
+    options: ControlOptions, observe: Callable[[Mapping[str, Any]], None]
+) -> ControlOptions:
+    """Return *options* with which *observe* gets each sample of the monitor, too."""
+    before = options.on_sample
+
+    def observe_both(sample: Mapping[str, Any]) -> None:
+        observe(sample)
+        if before is not None:
+            before(sample)
+
+    return dataclasses.replace(options, on_sample=observe_both)

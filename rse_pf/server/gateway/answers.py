@@ -9,11 +9,9 @@ from __future__ import annotations
 import traceback
 
 import msgspec
-import numpy as np
 
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError, UnknownService
-from rse_pf.extensions.recording.tap import RecordingTap
 from rse_pf.server.gateway.admission import UnreadRefusal
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.object_refs import ObjectRefs, takes_objects
@@ -147,8 +145,7 @@ class Answers:
                 service, code, now - queued.received_s, queued.robot.tenant, computed_s if counts_cpu else 0.0
             )
         connection.answer(answer.data, queued.command.id)
-        if connection.tap is not None and isinstance(queued.command.payload, msgspec.Struct):
-            _tell_pose(connection.tap, message, answer.data)
+        connection.tap.observe_answer(answer.data, queued.command, message)
         connection.commands += 1
         connection.last_result = code
         weak = _weakness(message)  # is logged as a failure is: an operator wants to know which poses are bad
@@ -273,13 +270,6 @@ class Answers:
         self._context.log.error(
             "defect", service=command.service, id=command.id, trace=command.trace, traceback=text
         )
-
-
-def _tell_pose(tap: RecordingTap, message: Result | Failure, data: bytes) -> None:
-    """Pass to a recording the pose in *data*, the answer to a plain `pnp` command."""
-    pose = getattr(message.reply, "T_camera_world", None) if isinstance(message, Result) else None
-    if isinstance(message, Result) and isinstance(pose, np.ndarray) and pose.dtype == np.float64:
-        tap.has_pose(data, message.id, pose.tobytes())
 
 
 def _weakness(message: Result | Failure) -> dict[str, str]:

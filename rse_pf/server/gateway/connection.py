@@ -14,7 +14,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.errors import RsePfError
 from rse_pf.server.gateway.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.server.gateway.handshake import Accepted
-from rse_pf.server.ports import Wire, WorkerContext
+from rse_pf.server.ports import NullMessageTap, Wire, WorkerContext
 from rse_pf.server.scheduling.overload import MAX_EARLY_COMMANDS
 from rse_pf.wire import Progress
 from rse_pf.wire.server_session import ServerSession
@@ -28,7 +28,8 @@ class RobotConnection:
     __slots__ = (
         "_assembler", "_awaited_id", "_context", "_deferred", "_early_commands", "_receive", "_wire",
         "allowed_s", "claims", "commands", "ignores_pauses", "is_connected", "last_heard_s", "last_result",
-        "moving_until_s", "number", "opened_s", "paused_until_s", "recorded", "robot", "session", "tap",
+        "moving_until_s", "number", "opened_s", "paused_until_s", "robot", "session", "tap",
+        "tap_connection",
     )  # fmt: skip
 
     def __init__(
@@ -76,11 +77,11 @@ class RobotConnection:
         self.is_connected = True
         self._receive = receive
         self._context = context
-        self.tap = None if session is None else context.tap
-        """Takes the messages for a recording, as those of the connection ``recorded``."""
-        self.recorded = 0
-        if self.tap is not None and session is not None:
-            self.recorded = self.tap.opened(session.codec.name, accepted.robot)
+        self.tap = NullMessageTap() if session is None else context.tap
+        """Observes the messages of the connection, whose number for the tap is ``tap_connection``."""
+        self.tap_connection = (
+            0 if session is None else self.tap.open_connection(session.codec.name, accepted.robot)
+        )
         self._wire = wire
         self._assembler = FrameAssembler(context.settings.session)
         self._deferred: deque[tuple[bytes, bool]] | None = None
@@ -134,16 +135,14 @@ class RobotConnection:
             if not self._assembler.closed:
                 self._context.metrics.bytes_out += len(data)
                 self._wire.send(data, session.codec.is_text)
-                if self.tap is not None:
-                    self.tap.down(self.recorded, data)
+                self.tap.observe_sent(self.tap_connection, data)
 
     def write(self, data: bytes) -> None:
         """Write one message, unless the connection is closing."""
         if not self._assembler.closed:
             self._context.metrics.bytes_out += len(data)
             self._wire.send(data, self.session is not None and self.session.codec.is_text)
-            if self.tap is not None:
-                self.tap.down(self.recorded, data)
+            self.tap.observe_sent(self.tap_connection, data)
 
     def write_progress(self, progress: Progress) -> None:
         """Write how far a long command is, if the robot is still connected and understands it."""
@@ -234,8 +233,7 @@ class RobotConnection:
     def end(self) -> None:
         """Note that the socket has ended: nothing more is written."""
         self.is_connected = False
-        if self.tap is not None:
-            self.tap.closed(self.recorded)
+        self.tap.close_connection(self.tap_connection)
 
     def _take(self, data: bytes, is_text: bool, now: float) -> None:
         """Pass on or defer one whole message; without a session, echo it."""
@@ -249,8 +247,7 @@ class RobotConnection:
             self._context.metrics.bytes_out += len(data)
             self._wire.send(data, is_text)
             return
-        if self.tap is not None:
-            self.tap.up(self.recorded, data)
+        self.tap.observe_received(self.tap_connection, data)
         works_for = self._context.crash.of_loop
         works_for[0] = self.number
         try:

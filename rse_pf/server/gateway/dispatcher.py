@@ -14,8 +14,6 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from msgspec import Struct
-
 from rse_pf.errors import Busy, NotFound, ProtocolError, UnknownService
 from rse_pf.server.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
 from rse_pf.server.gateway.answers import Answers
@@ -197,10 +195,7 @@ class Dispatcher:
             decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
         if decisions is not None and len(decisions) == 1 and type(decisions[0]) is Submit:
             command = decisions[0].command
-            tap = connection.tap
-            if tap is not None and isinstance(command.payload, Struct):
-                # The codec decodes a payload to a request only if it knows all fields of the message.
-                tap.is_plain(data, command.id, f"{command.stream} {command.trace}")
+            connection.tap.observe_command(data, command)
             self.submit(connection, command, len(data), now)
         elif decisions is not None:
             self._follow(connection, session, decisions, len(data), now, state, suspicion)
@@ -343,14 +338,14 @@ class Dispatcher:
     def snapshot(self) -> dict[str, Any]:
         """Return the numbers of this worker for /metrics and /status."""
         reports = [queue.report() for queue in self._queues]
-        metrics, tap = self.context.metrics, self.context.tap
+        metrics = self.context.metrics
         gauges = {
             "robots": float(sum(not connection.is_synthetic for connection in self.connections)),
             "loop_lag_s": self._lag_s,
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),
             **_NO_JOBS,
-            **({} if tap is None else {"recording_dropped": float(tap.dropped)}),
+            "recording_dropped": float(self.context.tap.dropped),
         }
         sections: dict[str, Any] = {}
         for report in reports:

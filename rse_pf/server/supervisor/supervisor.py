@@ -40,6 +40,7 @@ from rse_pf.server.gateway.migration import plan
 from rse_pf.server.jobs.slots import make_slot_file
 from rse_pf.server.log import JsonLog
 from rse_pf.server.metrics import merge, merge_isolation, render, tenant_cpu_s
+from rse_pf.server.ports import NullServerRecorder, ServerRecorder
 from rse_pf.server.supervisor.accepting import RobotAcceptor
 from rse_pf.server.supervisor.crash_recovery import CrashRecovery, spare_plans
 from rse_pf.server.supervisor.listener import bound_socket, check_authentication, open_control
@@ -52,12 +53,12 @@ from rse_pf.server.supervisor.orders import (
     RobotsOrder,
     UnblockOrder,
 )
-from rse_pf.server.supervisor.server_recording import ServerRecording, server_version
 from rse_pf.server.supervisor.session_registry import SessionRegistry
 from rse_pf.server.supervisor.trust_poller import poll_trust
 from rse_pf.server.supervisor.worker import WorkerPlan
 from rse_pf.server.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerProcess, fork_workers
 from rse_pf.storage.files import replace_json
+from rse_pf.version import installed_version
 
 __all__ = ["serve"]
 
@@ -86,7 +87,7 @@ def serve(
     services: str = BUILTIN,
     audit: Path | None = None,
     control_token: str | None = None,
-    recording_key: Path | None = None,
+    recorder: ServerRecorder | None = None,
 ) -> int:
     """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
 
@@ -101,7 +102,7 @@ def serve(
         services: ``module:function`` that makes the registry of a worker from the settings.
         audit: Folder of the audit log; None records nothing.
         control_token: Token that the control port requires for all but its two health pages; None: no token.
-        recording_key: File of the key of pseudonyms in recordings; None makes one.
+        recorder: Records what robots and this server send; None records nothing.
 
     Returns:
         0 after a drain or a signal, 1 when a worker was lost.
@@ -119,20 +120,21 @@ def serve(
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
     slots = make_slot_file()
-    with ServerRecording(settings, server_id, recording_key) as recording:
+    recorder = recorder or NullServerRecorder()
+    with recorder:
         plans = [
             WorkerPlan(
                 settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
                 services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
                 conformance_echo=conformance_echo, audit=audit is not None,
-                recording=recording.to_recorder,
+                recorder=recorder,
             )
             for index in range(count)
         ]  # fmt: skip
         with bound_socket(settings.serving.host, settings.serving.port) as listener:
             processes = fork_workers([*plans, *spare_plans(plans)], listener=listener)
             workers, spares = processes[:count], processes[count:]
-            recording.hand_over()
+            recorder.leave_to_workers()
             try:
                 log = JsonLog(
                     level=settings.serving.log_level, server=server_id, wall_clock=time.time
@@ -147,7 +149,7 @@ def serve(
                         server_id=server_id, digest=digest, announce=announce, control_token=control_token
                     )
                     supervisor = _Supervisor(
-                        settings, identity, _Processes(workers=workers, spares=spares, others=recording.pids),
+                        settings, identity, _Processes(workers=workers, spares=spares, others=recorder.pids),
                         trust=trust, listener=listener, log=log, records=records,
                     )  # fmt: skip
                     return run_in_loop(supervisor.run())
@@ -392,7 +394,7 @@ class _Supervisor:
         return json_reply(
             {
                 "server": self._server_id,
-                "version": server_version(),
+                "version": installed_version(),
                 "settings": self._digest,
                 "uptime_s": round(time.monotonic() - self._began, 3),
             }
@@ -434,7 +436,7 @@ class _Supervisor:
         return json_reply(
             {
                 **self._identity(),
-                "version": server_version(),
+                "version": installed_version(),
                 "state": self._state,
                 "uptime_s": round(time.monotonic() - self._began, 3),
                 "robots": int(gauges.get("robots", 0)),

@@ -28,7 +28,6 @@ from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings, ServiceSettings
 from rse_pf.errors import ConfigurationError, RsePfError, message_of
-from rse_pf.extensions.recording.tap import RecordingTap, hand_pipe
 from rse_pf.identity import RobotId
 from rse_pf.processes.event_loop import event_loop_maker
 from rse_pf.processes.ipc import receive_bytes
@@ -50,7 +49,7 @@ from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.server.log import JsonLog
 from rse_pf.server.object_refs import ObjectRefs
-from rse_pf.server.ports import Clocks, WorkerContext
+from rse_pf.server.ports import Clocks, NullServerRecorder, ServerRecorder, WorkerContext
 from rse_pf.server.robot_store import is_shared
 from rse_pf.server.sandbox.circuit_breaker import Block
 from rse_pf.server.sandbox.manager import SandboxHost, SandboxManager
@@ -120,8 +119,7 @@ class WorkerPlan:
     """What is left when native code ends it."""
     is_spare: bool = False
     """Whether it waits for a `BeginOrder`, which gives it the index of a worker that crashed."""
-    recording: int | None = None
-    """Socket on which the recorder takes the ends of pipes; None where nothing is recorded."""
+    recorder: ServerRecorder = field(default_factory=NullServerRecorder)
 
 
 def repeat_for(seconds: float, step: Callable[[], bool], clock: Callable[[], float]) -> None:
@@ -201,7 +199,7 @@ class _Worker:
             clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
             loop=loop,
             log=self._log,
-            tap=self._tap(plan.recording),
+            tap=plan.recorder.open_tap(loop.call_later, log),
             crash=plan.crash,
         )
         connections = set[RobotConnection]()
@@ -253,25 +251,6 @@ class _Worker:
             workers=self._workers,
             new_name=self._new_name,
             recorder=self._recorder,
-        )
-
-    def _tap(self, fd: int | None) -> RecordingTap | None:
-        if fd is None:
-            return None
-        hint = "a new one is started; restart the server if none is"
-
-        def renew() -> int | None:
-            self._log.error("recorder-lost", hint=hint)
-            return hand_pipe(fd)
-
-        pipe = hand_pipe(fd)
-        if pipe is None:
-            return None
-        return RecordingTap(
-            pipe,
-            call_later=self._loop.call_later,
-            on_dead=lambda: self._log.error("recording-over", hint="restart the server to record again"),
-            renew=renew,
         )
 
     def _compute(
@@ -393,9 +372,7 @@ class _Worker:
                 break
         self._recorder.flush()
         self._robot_events.flush()
-        tap = self._dispatcher.context.tap
-        if tap is not None:
-            tap.hand_over()
+        self._dispatcher.context.tap.flush()
         self._log.close()
         os._exit(0)  # nobody waits for the sockets and threads that are left
 

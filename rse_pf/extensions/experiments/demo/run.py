@@ -56,6 +56,7 @@ from rse_pf.extensions.experiments.results.result_folder import (
     remove_keys,
     write_json,
 )
+from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
 from rse_pf.geometry import Array
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.maps.format import MapVersion
@@ -140,6 +141,7 @@ async def _run(
                     name="demo",
                     on_event=lambda event: events.copy(event, now()),
                     data=options.merge or options.live,
+                    recorder=make_platform_recorder(settings, folder / "platform"),
                 )
             )
             disturbance = None

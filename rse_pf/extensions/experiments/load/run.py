@@ -37,6 +37,7 @@ from rse_pf.extensions.experiments.results.result_folder import (
     write_json,
 )
 from rse_pf.extensions.experiments.results.summary import percent_answered, percentiles, summarise
+from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.terminal import show, show_page
 
@@ -136,6 +137,7 @@ async def _run(
                     port=0,
                     name="swarm",
                     on_event=lambda event: events.copy(event, time.monotonic() - origin),
+                    recorder=make_platform_recorder(settings, state),
                 )
             )
             platform = TargetPlatform(local.url, local.issue_token)

@@ -32,6 +32,7 @@ from rse_pf.extensions.experiments.results.records import (
     write_commands,
 )
 from rse_pf.extensions.experiments.results.result_folder import remove_keys
+from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.monitor import MonitorSample
 from rse_pf.local.control.platform import LocalPlatform
@@ -103,6 +104,7 @@ class Harness:
             on_event=lambda event: self.log(str(event["event"]), **event_details(event)),
             servers=self._servers,
             control=self._control,
+            recorder=make_platform_recorder(self.settings, self.folder / "platform"),
         )
         try:
             self.platform = await self._stack.enter_async_context(platform)

@@ -1,4 +1,4 @@
-"""The recording of one server: a recorder process, which ends with the last worker, and is restarted before.
+"""Record one server: start the recorder process, which exits after the last worker, and restart it.
 
 A server serves robots whether it can record or not.
 """
@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
-from importlib import metadata
 from pathlib import Path
 
 import msgspec
@@ -23,30 +22,24 @@ import msgspec
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.recording.recorder_process import RecorderPlan, start_recorder
 from rse_pf.extensions.recording.redact import KEY_BYTES
+from rse_pf.extensions.recording.tap import RecordingTap, hand_pipe
 from rse_pf.processes.start import Child
+from rse_pf.server.ports import Log, MessageTap, NullMessageTap
+from rse_pf.version import installed_version
 from rse_pf.wire import PROTOCOL_VERSION
 
-__all__ = ["ServerRecording", "server_version"]
+__all__ = ["FileServerRecorder"]
 
 _FINISH_S = 3.0
 """Time that the recorder has to finish its file when the workers are gone."""
 _MOST_RESTARTS, _WITHIN_S = 5, 600.0
 
 
-def server_version() -> str:
-    """Return the version of the installed platform, "unknown" in a plain checkout."""
-    try:
-        return metadata.version("rse-pf")
-    except metadata.PackageNotFoundError:
-        return "unknown"
+class FileServerRecorder:
+    """Record one server in files, inside of ``with``; a `rse_pf.server.ports.ServerRecorder`.
 
-
-class ServerRecording:
-    """The recorder of one server, inside of ``with``; it is there before workers are forked.
-
-    A recorder that ended, although there are workers, is started again up to five times in ten minutes.
-    Workers send it the ends of their pipes by the socket ``to_recorder``, None where nothing is recorded;
-    ``pids`` has its process.
+    A recorder process that exits although there are workers is started again, up to five times in ten
+    minutes.  Workers send it the ends of their pipes by the socket ``to_recorder``.
     """
 
     def __init__(
@@ -62,7 +55,7 @@ class ServerRecording:
         """Start nothing yet.
 
         Args:
-            settings: Of the server.
+            settings: Of the server; ``recording.folder`` is set.
             server: Its name.
             key: File of the key of pseudonyms, None for a key of its own.
             start: Starts a recorder with its key.
@@ -82,17 +75,15 @@ class ServerRecording:
         self._watching: threading.Thread | None = None
         self._is_over = threading.Event()
 
-    def __enter__(self) -> ServerRecording:
-        """Start the recorder, if ``recording.folder`` is set."""
+    def __enter__(self) -> FileServerRecorder:
+        """Start the recorder process."""
         recording = self._settings.recording
-        if not recording.folder:
-            return self
         self._from_workers, self._to_recorder = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._to_recorder.setblocking(False)
         self.to_recorder = self._to_recorder.fileno()
         plan = RecorderPlan(
-            folder=recording.folder, server=self._server, version=server_version(), started_ns=time.time_ns(),
-            from_workers=self._from_workers.fileno(),
+            folder=recording.folder, server=self._server, version=installed_version(),
+            started_ns=time.time_ns(), from_workers=self._from_workers.fileno(),
             max_bytes=recording.max_bytes, session=asdict(self._settings.session), key=self._key,
             metadata={
                 "side": "server", "protocol": str(PROTOCOL_VERSION), "engine": self._settings.pnp.engine,
@@ -106,7 +97,25 @@ class ServerRecording:
         )
         return self
 
-    def hand_over(self) -> None:
+    def open_tap(self, call_later: Callable[[float, Callable[[], None]], object], log: Log) -> MessageTap:
+        """Return the tap of a worker, connected to the recorder; the worker was forked from this process."""
+        to_recorder = self.to_recorder
+        pipe = None if to_recorder is None else hand_pipe(to_recorder)
+        if to_recorder is None or pipe is None:
+            return NullMessageTap()
+
+        def renew() -> int | None:
+            log.error("recorder-lost", hint="a new one is started; restart the server if none is")
+            return hand_pipe(to_recorder)
+
+        return RecordingTap(
+            pipe,
+            call_later=call_later,
+            on_dead=lambda: log.error("recording-over", hint="restart the server to record again"),
+            renew=renew,
+        )
+
+    def leave_to_workers(self) -> None:
         """Leave the socket to the workers, so that the recorder sees their end, and watch the recorder.
 
         Nothing may be forked afterwards: there is a thread.
@@ -121,7 +130,7 @@ class ServerRecording:
         """Wait until the recorder has finished its file; all workers are gone."""
         if self._watching is None:
             return
-        self.hand_over()
+        self.leave_to_workers()
         self._is_over.set()
         self._watching.join(_FINISH_S)
         if self._from_workers is not None:

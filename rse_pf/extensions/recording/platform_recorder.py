@@ -1,12 +1,11 @@
-"""The control plane's part of a recording: a file of events of the platform and samples of its monitor.
+"""Record the events of a local platform and the samples of its monitor.
 
-It also makes the key of the pseudonyms, which all servers of a recording share, and deletes it at the end.
-A disk that is full neither delays nor ends the platform.
+The recorder also makes the key of the pseudonyms, which all servers of a recording share, and deletes it at
+the end.  A full disk neither delays nor ends the platform.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import secrets
 import time
 from collections.abc import Callable, Mapping
@@ -17,11 +16,10 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.recording.file_format import EVENT_SCHEMA, EVENTS_TOPIC, SAMPLE_SCHEMA, SAMPLES_TOPIC
 from rse_pf.extensions.recording.writer import RecordingWriter
-from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.state import recording_key_file
 from rse_pf.storage.files import create_private_file
 
-__all__ = ["PlatformRecording"]
+__all__ = ["FilePlatformRecorder", "make_platform_recorder"]
 
 _CONTROL_PLANE = "control-plane"
 _KEY_BYTES = 32
@@ -29,35 +27,25 @@ _LEFT_OUT = ("robot", "robots_named", "tenant", "token", "url")
 """Fields of events that may hold a name or an address."""
 
 
-class PlatformRecording:
-    """Events and samples of one platform; nothing at all where ``recording.folder`` is empty."""
+def make_platform_recorder(settings: PlatformSettings, state: Path) -> FilePlatformRecorder | None:
+    """Return the recorder of the platform in the folder *state*, None if *settings* ask for no recording."""
+    return FilePlatformRecorder(settings, state) if settings.recording.folder else None
+
+
+class FilePlatformRecorder:
+    """Record one platform in a file; a `rse_pf.local.control.platform_recorder.PlatformRecorder`."""
 
     def __init__(
         self, settings: PlatformSettings, state: Path, time_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._recording = settings.recording
-        self._key = recording_key_file(state)
+        self._key = recording_key_file(state.absolute())
         self._time_ns = time_ns
         self._writer: RecordingWriter | None = None
-
-    def watching(self, options: ControlOptions) -> ControlOptions:
-        """Return *options* by which samples are recorded, too."""
-        if not self._recording.folder:
-            return options
-        before = options.on_sample
-
-        def on_sample(sample: Mapping[str, Any]) -> None:
-            self._write(SAMPLES_TOPIC, SAMPLE_SCHEMA, dict(sample))
-            if before is not None:
-                before(sample)
-
-        return dataclasses.replace(options, on_sample=on_sample)
 
     def begin(self) -> None:
         """Make the key of the pseudonyms, unless an earlier control plane left one; begin the file."""
         recording = self._recording
-        if not recording.folder:
-            return
         with suppress(FileExistsError):
             create_private_file(self._key, secrets.token_hex(_KEY_BYTES))
         self._writer = RecordingWriter(
@@ -66,7 +54,11 @@ class PlatformRecording:
             metadata={"side": "platform"},
         )  # fmt: skip
 
-    def event(self, event: Mapping[str, Any]) -> None:
+    def record_sample(self, sample: Mapping[str, Any]) -> None:
+        """Record one sample of the monitor."""
+        self._write(SAMPLES_TOPIC, SAMPLE_SCHEMA, dict(sample))
+
+    def record_event(self, event: Mapping[str, Any]) -> None:
         """Record one event of the platform."""
         details = {name: value for name, value in event.items() if name not in (*_LEFT_OUT, "event")}
         self._write(EVENTS_TOPIC, EVENT_SCHEMA, {"kind": event["event"], **details})

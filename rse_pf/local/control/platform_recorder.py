@@ -1,0 +1,40 @@
+"""What a local platform needs of the recorder of its events; without a recorder, nothing is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+__all__ = ["NullPlatformRecorder", "PlatformRecorder"]
+
+
+class PlatformRecorder(Protocol):
+    """Record the events of a platform and the samples of its monitor; no method raises."""
+
+    def begin(self) -> None:
+        """Begin to record, before the first server starts; this control plane holds the platform's lock."""
+
+    def record_event(self, event: Mapping[str, Any]) -> None:
+        """Record one event of the platform."""
+
+    def record_sample(self, sample: Mapping[str, Any]) -> None:
+        """Record one sample of the monitor."""
+
+    def close(self) -> None:
+        """Finish the recording; all servers have exited."""
+
+
+class NullPlatformRecorder:
+    """Record nothing."""
+
+    def begin(self) -> None:
+        """Do nothing."""
+
+    def record_event(self, event: Mapping[str, Any]) -> None:
+        """Ignore an event."""
+
+    def record_sample(self, sample: Mapping[str, Any]) -> None:
+        """Ignore a sample."""
+
+    def close(self) -> None:
+        """Do nothing."""
