@@ -20,8 +20,8 @@ from rse_pf.errors import BadRequest, RsePfError
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.processes.ipc import FrameReader
+from rse_pf.server.sandbox.channel import outcome_of
 from rse_pf.server.sandbox.policy import SandboxReply
-from rse_pf.server.sandbox.replies import outcome_of
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Command, Failure, Result, make_codec

@@ -1,8 +1,8 @@
 """Record the authentication of robots: accepted and refused handshakes, renewals, and revoked connections.
 
 `AuditRecorder` collects notes in a worker; `ServerAudit` writes them in the supervisor.  A handshake never
-waits for the log, a flood of refusals is counted instead of written, and what an unverified token says is
-recorded as claimed.
+waits for the log.  Refusals beyond a rate are counted instead of written one by one, and the names in an
+unverified token are recorded as claimed.
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ from rse_pf.server.ports import Clocks
 
 __all__ = ["AuditRecorder", "ServerAudit"]
 
-_MAX_NOTES = 500
-"""Notes in one message; a line of the channel may have 1 MiB."""
-_SUM_UP_S = 10.0
+_MAX_NOTES = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
+_SUM_UP_S = 10.0  # counted refusals are written as one entry this often
 _UNAUTHORIZED = 401
 
 _W = TypeVar("_W")
@@ -49,7 +48,7 @@ class AuditRecorder:
             loop: For the time of the next batch.
             tell: Sends a message to the supervisor.
             is_on: Whether anything is recorded.
-            refusals: How many refusals are recorded one by one; None means the default.
+            refusals: Limits how many refusals are recorded one by one; None means the default limits.
         """
         self._clocks = clocks
         self._loop = loop

@@ -43,16 +43,16 @@ class RobotConnection:
         now: float,
         number: int = 0,
     ) -> None:
-        """Know the robot; its session waits for a Hello.
+        """Wait for the Hello of the robot.
 
         Args:
             context: The settings, clocks, event loop and metrics of the worker.
             wire: The socket.
-            session: The rules of the protocol; None echoes messages, for the conformance test of WebSocket.
-            accepted: The robot, its claims and its codec, as the handshake gave them.
+            session: The rules of the protocol; None echoes messages, for conformance tests of WebSocket.
+            accepted: The robot, its claims and its codec, from the handshake.
             receive: Called with the connection, its session, each whole message, and the time of its arrival.
             now: Monotonic time in seconds, as all times here.
-            number: Which socket of the server this is, in the order of acceptance.
+            number: Number of the socket on this server, in the order of acceptance.
         """
         self.robot = accepted.robot
         self.claims: Claims | None = accepted.claims
@@ -61,18 +61,18 @@ class RobotConnection:
         self.number = number
         self.opened_s = self.last_heard_s = now
         self.allowed_s = context.settings.session.answer_timeout_s
-        """Time that the last command had, from its arrival to its deadline."""
+        """Seconds that the last command had from its arrival to its deadline."""
         self.paused_until_s = float("-inf")
-        """Until when the robot has to pause, as long as commands wait."""
+        """The robot has to pause until this time, as long as commands wait."""
         self.ignores_pauses = False
-        """Whether it sent on in a pause: while commands wait, it is not refused any more, but read one
-        command at a time.  This holds until the robot connects again: it would ignore the next pause, too.
-        """
+        """Whether the robot sent more than `MAX_EARLY_COMMANDS` in a pause.  While commands wait, it is then
+        read one command at a time and no longer refused, until it connects again."""
         self._early_commands = 0
         self._awaited_id: int | None = None
         self.commands = 0
-        """How many of its commands were answered; ``last_result`` is ``ok`` or the code of the last one."""
+        """How many of its commands were answered."""
         self.last_result = ""
+        """The result of the last of them: ``ok`` or the code of a failure."""
         self.moving_until_s = float("-inf")
         self.is_connected = True
         self._receive = receive
@@ -85,7 +85,8 @@ class RobotConnection:
         self._wire = wire
         self._assembler = FrameAssembler(context.settings.session)
         self._deferred: deque[tuple[bytes, bool]] | None = None
-        """Messages that arrived while the decoder thread has one of this robot, or one awaits its answer."""
+        """Messages that arrived while one of this robot is decoded in a thread, or while a command must be
+        answered first; None if messages are passed on at once."""
 
     @property
     def is_closing(self) -> bool:
@@ -94,7 +95,8 @@ class RobotConnection:
 
     @property
     def is_synthetic(self) -> bool:
-        """Whether the robot belongs to the platform itself, such as the canary: it is no load."""
+        """Whether the robot belongs to the platform, such as the canary, so that it does not count as
+        load."""
         return self.claims is not None and SYNTHETIC in self.claims.scopes
 
     @property
@@ -104,7 +106,7 @@ class RobotConnection:
 
     @property
     def is_shown(self) -> bool:
-        """Whether an operator sees the robot: it said Hello, and does not belong to the platform itself."""
+        """Whether operators see the robot: it said Hello, and does not belong to the platform."""
         return self.session is not None and not self.is_opening and not self.is_synthetic
 
     @property
@@ -145,13 +147,13 @@ class RobotConnection:
             self.tap.observe_sent(self.tap_connection, data)
 
     def write_progress(self, progress: Progress) -> None:
-        """Write how far a long command is, if the robot is still connected and understands it."""
+        """Write the progress of a long command, if the robot is connected and announced the capability."""
         if self.is_connected and self.session is not None and self.session.hears_progress:
             self.write(self.session.codec.encode(progress))
 
     @property
     def unsent_bytes(self) -> int:
-        """How much was written that the kernel has not taken, because the robot reads slowly."""
+        """Bytes that were written and that the kernel has not taken, because the robot reads slowly."""
         return self._wire.unsent_bytes()
 
     def bound_unsent(self, max_bytes: int) -> None:

@@ -1,7 +1,7 @@
-"""Assemble WebSocket frames into messages, and decide when a robot broke RFC 6455 or a limit.
+"""Assemble WebSocket frames into messages by RFC 6455, and close the connection that breaks it or a limit.
 
-Frames and times go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).  At most one message of
-allowed size is held.
+Frames and times go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).  At most one message is
+held, of at most ``session.max_message_bytes``.
 """
 
 from __future__ import annotations
@@ -33,10 +33,9 @@ CLOSE_INVALID_TEXT = 1007
 CLOSE_POLICY = 1008
 CLOSE_TOO_BIG = 1009
 
-MAX_CONTROL_PER_S = 10.0
-"""Control frames of one socket in a second; a robot sends a ping every other second."""
+MAX_CONTROL_PER_S = 10.0  # control frames of one socket: a robot sends a ping every other second
 _CONTROL = (CLOSE, PING, PONG)
-_MAX_CONTROL = 125
+_MAX_CONTROL = 125  # bytes in a control frame: RFC 6455, 5.5
 _KNOWN_CLOSE_CODES = frozenset({1000, 1001, 1002, 1003, 1007, 1008, 1009, 1010, 1011, 1012, 1013, 1014})
 
 
@@ -54,7 +53,7 @@ class SendPong(msgspec.Struct, frozen=True, gc=False):
 
 
 class CloseSocket(msgspec.Struct, frozen=True, gc=False):
-    """Send this close code, then end the connection."""
+    """Send a CLOSE frame with this code, then end the connection."""
 
     code: int
     reason: str = ""
@@ -64,7 +63,7 @@ FrameDecision = Received | SendPong | CloseSocket
 
 
 class FrameAssembler:
-    """The frames of one socket, and the message that they are part of."""
+    """The message of one socket whose frames have arrived in part."""
 
     __slots__ = (
         "_control_frames",
@@ -158,10 +157,10 @@ class FrameAssembler:
 
 
 class CloseBorder:
-    """Find where the first CLOSE frame of a byte stream ends.
+    """Find the end of the first CLOSE frame in a byte stream.
 
-    A parser that looks one frame ahead would answer invalid bytes behind a CLOSE before the CLOSE itself,
-    although nothing behind it counts (RFC 6455, 5.5.1).  Only the borders of frames are looked at here.
+    Bytes behind a CLOSE frame must be ignored (RFC 6455, 5.5.1), but picows parses one frame ahead, and would
+    answer invalid bytes behind the CLOSE before the CLOSE itself.  Only the headers of frames are read here.
     """
 
     __slots__ = ("_head", "_is_close", "_left", "is_upgraded", "shut")
@@ -175,7 +174,7 @@ class CloseBorder:
         self._is_close = False
 
     def bytes_to_close(self, data: memoryview, n: int) -> int:
-        """Return how many of the next bytes, the first *n* of *data*, are not behind a CLOSE."""
+        """Return how many of the next bytes, the first *n* of *data*, are not behind a CLOSE frame."""
         if self.shut:
             return 0
         payload_left = self._left
@@ -184,7 +183,7 @@ class CloseBorder:
                 self._left = payload_left - n
                 return n
         elif self.is_upgraded and not self._head and n >= 6 and not data[0] & 8:
-            # One whole masked data frame of less than 64 KiB, as most pieces are.
+            # Fast path for most reads: one whole masked data frame of less than 64 KiB.
             size = data[1] - 128
             if n == (8 + (data[2] << 8) + data[3] if size == 126 else 6 + size if size < 126 else 0):
                 return n

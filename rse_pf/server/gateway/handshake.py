@@ -1,9 +1,9 @@
-"""Judge a WebSocket handshake: path, capacity, token and sub-protocol, before anything is accepted.
+"""Accept or reject a WebSocket handshake by path, origin, capacity, token and sub-protocol, in this order.
 
-Every rejection has a fixed body, and the cause of a rejected token goes to the log only; but a robot whose
-token was signed with its own enrolled key is told why.  What a robot sent and
-the time come in, `Accepted` or `Rejected` goes out.  The head of a request is read here, too: most refusals
-need no WebSocket library then.
+Every rejection has a fixed body, and the cause of a rejected token goes to the log only.  Only a robot whose
+token was signed with its own enrolled key gets the cause.  The head of the request and the time come in,
+`Accepted` or `Rejected` goes out.  The head is parsed here, too, so that most refusals need no WebSocket
+library.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
 HEALTH = "health"
 """Result of a request for the health page."""
 
-_RETRY_AFTER_S = 2
+_RETRY_AFTER_S = 2  # a full server is asked again after this, when robots may have left
 _HEALTH_PATH = HEALTH_PATH.encode()
 _NO_KEYS = "no-keys"
 _JSON = {"Content-Type": "application/json"}
@@ -50,8 +50,8 @@ _HEAD = re.compile(
     rb"GET ([\x21-\x7e\x80-\xff]+) HTTP/1\.1((?:\r\n[0-9A-Za-z!#$%&'*+.^_`|~-]+:[\t\x20-\x7e\x80-\xff]*)*)"
 )
 """RFC 9112, without the folded lines that it calls obsolete."""
-_MAX_HEADERS = 128
-_SINGLE = (b"content-length", b"sec-websocket-key", b"sec-websocket-version")
+_MAX_HEADERS = 128  # far more than robots, browsers and proxies send
+_SINGLE = (b"content-length", b"sec-websocket-key", b"sec-websocket-version")  # must not be repeated
 _WEBSOCKET_KEY = re.compile(rb"[A-Za-z0-9+/]{22}==")
 _VERSIONS = (b"13", b"8", b"7")
 _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
@@ -59,7 +59,7 @@ _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accepted:
-    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires."""
+    """A robot that may upgrade to WebSocket; ``expires_s`` is in Unix seconds, None if it never expires."""
 
     robot: RobotId
     codec: str
@@ -82,7 +82,7 @@ class Rejected:
 
 
 class RequestHead:
-    """The head of an HTTP request that was checked line by line.  A header that is repeated is one list."""
+    """The head of an HTTP request that was checked line by line; repeated headers are joined by commas."""
 
     __slots__ = ("_headers", "path", "websocket_key")
 
@@ -94,7 +94,7 @@ class RequestHead:
 
     @classmethod
     def parse(cls, data: bytes) -> RequestHead | None:
-        """Return the head *data*, without its empty line; None if it is no GET that has no body.
+        """Return the head in *data*, which lacks its empty line; None unless it is a GET without a body.
 
         Source:
             RFC 9112, 3 and 5; RFC 6455, 4.2.1.
@@ -120,12 +120,12 @@ class RequestHead:
         return cls(request_line[1], headers)
 
     def text(self, name: bytes) -> str:
-        """Return the header *name*, in lower case letters, "" if it is absent."""
+        """Return the header *name*, which is given in lower case; "" if it is absent."""
         value = self._headers.get(name)
         return "" if value is None else value.decode("ascii", "surrogateescape")
 
     def words(self, name: bytes) -> list[str]:
-        """Return the entries of the list *name*."""
+        """Return the comma-separated entries of the header *name*."""
         text = self.text(name)
         return [word.strip() for word in text.split(",")] if "," in text else [text]
 
@@ -158,7 +158,7 @@ def banned_rejection(seconds: float) -> Rejected:
 
 
 def _proven_rejection(proven: ProvenRefusal, now_s: float) -> Rejected | None:
-    """Return the rejection of a robot that proved its key; None if the cause is kept from it, too."""
+    """Return the rejection of a robot whose signature is valid; None if even it does not get the cause."""
     members: dict[str, float] = {"server_s": round(now_s, 3)}
     cause = proven.cause
     if cause == "disabled":
@@ -194,15 +194,20 @@ def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, st
 
 
 class HandshakeRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """What a handshake is judged by; a header that is absent is empty."""
+    """The parts of a handshake that decide whether it is accepted; a header that is absent is empty.
+
+    Attributes:
+        path: The path with its query.
+        authorization: The header ``Authorization``.
+        offered: The sub-protocols that the robot offers, in its order.
+        origin: The header ``Origin``, which browsers send.
+        host: The header ``Host``.
+    """
 
     path: bytes
-    """With its query."""
     authorization: str
     offered: list[str]
-    """Sub-protocols, in the robot's order."""
     origin: str = ""
-    """Browsers send it."""
     host: str = ""
 
 
@@ -252,13 +257,13 @@ class HandshakePolicy:
         anonymous: str,
         now_s: float,
     ) -> Accepted | Rejected:
-        """Return which robot is accepted, or the HTTP answer that rejects it.
+        """Return the accepted robot, or the HTTP answer that rejects the handshake.
 
         Args:
-            request: What the robot sent.
-            is_full: Whether the worker has as many robots as it may.
-            anonymous: Name of a robot where no token is required.
-            now_s: Unix seconds.
+            request: The parts of the request that decide.
+            is_full: Whether the worker has its greatest number of robots.
+            anonymous: Name of the robot where no token is required.
+            now_s: Unix time in seconds.
         """
         path, authorization, offered = request.path, request.authorization, request.offered
         if self._conformance_echo:
@@ -283,7 +288,7 @@ class HandshakePolicy:
         return self._no_subprotocol if codec is None and isinstance(verdict, Accepted) else verdict
 
     def _with_token(self, token: str, now_s: float, *, codec: str) -> Accepted | Rejected:
-        """Return the robot that *token* names as accepted, or the rejection."""
+        """Accept the robot of *token*, or return the rejection."""
         if self.keys is None:
             return replace(self._no_token, reason=_NO_KEYS)
         try:
@@ -298,7 +303,10 @@ class HandshakePolicy:
         )  # fmt: skip
 
     def ends_s(self, claims: Claims, now_s: float) -> float:
-        """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""
+        """Return the Unix time (s) at which a connection with *claims* is closed.
+
+        For a token that has expired within ``auth.leeway_s``, it is the end of that leeway.
+        """
         leeway_s = self._settings.auth.leeway_s
         return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
 

@@ -1,8 +1,12 @@
-"""The robots' sockets of one worker: picows on uvloop, between the supervisor's descriptors and the
-dispatcher.
+"""The sockets of robots in one worker: handshakes, then WebSocket connections by picows on uvloop.
 
-Only this file knows picows.  The text of an exception never reaches a robot, a robot that reads too slowly is
-cut off, and nothing behind the first CLOSE frame is read.
+1. `RobotSockets` reads the head of the request from each socket that the supervisor passed to this worker,
+   and answers the handshake, in small time slices.
+2. An accepted socket gets a `RobotProtocol`, which passes bytes to picows, and a `Listener`, which passes
+   frames to a `RobotConnection` and writes for it.
+
+Only this file uses picows.  The text of an exception never reaches a robot, a robot that reads too slowly is
+disconnected, and nothing behind the first CLOSE frame is read.
 """
 
 from __future__ import annotations
@@ -43,30 +47,25 @@ picows: Any = _picows  # its stubs lack what is used here
 
 __all__ = ["PendingSocket", "RobotSockets"]
 
-_MAX_CLOSE_REASON_BYTES = 123
+_MAX_CLOSE_REASON_BYTES = 123  # RFC 6455, 5.5: a control frame has at most 125 bytes, two of them the code
 _UPGRADE = (
     b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: %b\r\n\r\n"
 )
-"""The request that picows gets in place of the judged one; it holds it as long as the connection lives."""
+"""The request that picows gets in place of the robot's own, since it keeps it as long as the connection."""
 _SWITCHING = 101
 _NO_HEADERS: dict[str, str] = {}
-_MAX_READ_BYTES = 16384
-"""Bytes read at once: thousands of the smallest frames fit in, and the other robots wait meanwhile."""
-_HANDSHAKES_S = 0.0005
-"""Handshakes are read, judged and ended for so long in one round of the event loop."""
-_MAX_WAITING = 8
-"""New sockets that wait for their first look; the supervisor's channel holds the others."""
-_LINGER_S = 2.0
-"""Time that a robot has to read the CLOSE frame and to end its side; then the socket is cut."""
-_READ_BUFFER_BYTES = 2048
-"""The first read buffer of a socket; it grows with the messages."""
+_MAX_READ_BYTES = 16384  # read from one socket before the next: that is up to 2,700 of the smallest frames
+_HANDSHAKES_S = 0.0005  # for handshakes in one round of the event loop, so that commands hardly wait for them
+_MAX_WAITING = 8  # new sockets that wait for their first read; others wait in the supervisor's channel
+_LINGER_S = 2.0  # for a robot to read the CLOSE frame and to close its side, before the socket is closed
+_READ_BUFFER_BYTES = 2048  # first read buffer of a socket: small for idle robots; it grows with messages
 _TEXT = int(picows.WSMsgType.TEXT)
 _BINARY = int(picows.WSMsgType.BINARY)
 
 
 class _NoLogger:
-    """The logger that picows gets; otherwise it would make one for each socket."""
+    """The logger that picows gets, so that it does not make one for each socket."""
 
     def isEnabledFor(self, level: int) -> bool:
         return False
@@ -80,7 +79,7 @@ _NO_LOGGER = _NoLogger()
 
 
 class _RobotSocket(socket.socket):
-    """An accepted socket, without the questions to the kernel that libraries ask for their log lines."""
+    """An accepted socket without the system calls that libraries make only for their log lines."""
 
     family = socket.AF_INET  # IPv6 has the same options
     type = socket.SOCK_STREAM
@@ -95,14 +94,14 @@ class _RobotSocket(socket.socket):
 
 
 class PendingSocket:
-    """An accepted socket until its handshake is judged.
+    """An accepted socket until its handshake is answered.
 
     Attributes:
         peer: Address of the other end of the TCP connection.
-        number: Which socket of the server it is.
+        number: Number of the socket on this server, in the order of acceptance.
         on_end: Called once, at the end of the socket.
         seen: The bytes of its request that have arrived.
-        timeout: The timer that ends it; None while nobody had to wait for its request.
+        timeout: The timer that closes it; None before the first read, and after the whole request was read.
     """
 
     __slots__ = ("accepted", "number", "on_end", "peer", "seen", "timeout")
@@ -118,7 +117,7 @@ class PendingSocket:
         self.timeout: asyncio.TimerHandle | None = None
 
     def close(self, answer: bytes = b"") -> None:
-        """End the socket, with *answer* if there is one."""
+        """Send *answer*, if there is one, and close the socket."""
         if answer:
             # An answer is far shorter than what the kernel buffers; a robot that is gone gets none.
             with contextlib.suppress(OSError):
@@ -180,7 +179,7 @@ class RobotSockets:
 
     @property
     def is_behind(self) -> bool:
-        """Whether so many handshakes wait that no further socket should be taken in this round."""
+        """Whether no further socket should be taken in this round, because `_MAX_WAITING` handshakes wait."""
         return len(self._steps) >= _MAX_WAITING
 
     def take(self, fd: int, on_end: Callable[[], None], number: int, peer: str) -> None:
@@ -189,7 +188,7 @@ class RobotSockets:
         Args:
             fd: The descriptor, which belongs to this object from now on.
             on_end: Called once, at the end of the socket.
-            number: Which socket of the server it is, in the order of acceptance.
+            number: Number of the socket on this server, in the order of acceptance.
             peer: Address of the other end of the TCP connection.
         """
         family = socket.AF_INET6 if ":" in peer else socket.AF_INET
@@ -209,12 +208,12 @@ class RobotSockets:
             self._cut(surplus)
 
     def _cut_late(self, pending: PendingSocket) -> None:
-        """End a socket whose time is over, unless its request came meanwhile."""
+        """Close a socket whose time is over, unless its request has arrived meanwhile."""
         if pending.timeout is not None:
             self._cut(pending)
 
     def _cut(self, pending: PendingSocket) -> None:
-        """End a socket without an answer."""
+        """Close a socket without an answer."""
         self._forget(pending)
         pending.close()
 
@@ -231,12 +230,12 @@ class RobotSockets:
         self._steps.add(self._read_on, pending)
 
     def _read_on(self, pending: PendingSocket) -> None:
-        # One that was cut while it waited for its turn is not read.
+        # A socket that was closed while it waited for this step is not read.
         if pending.timeout is not None and not self._read(pending):
             self._context.loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)
 
     def _read(self, pending: PendingSocket) -> bool:
-        """Read the part of the request that has arrived; return whether the socket is no longer pending."""
+        """Read what has arrived of the request; return whether the socket was answered or closed."""
         max_bytes = MAX_HANDSHAKE_BYTES
         try:
             # Closing with unread bytes would reset the connection, and its answer would be lost.
@@ -255,11 +254,11 @@ class RobotSockets:
         elif end < 0:
             self._refuse(pending, self._handshake.too_long, pending.peer, "")
         else:
-            self._judge(pending, RequestHead.parse(pending.seen[:end]), pending.seen[end + 4 :])
+            self._answer_handshake(pending, RequestHead.parse(pending.seen[:end]), pending.seen[end + 4 :])
         return True
 
-    def _judge(self, pending: PendingSocket, head: RequestHead | None, rest: bytes) -> None:
-        """Answer a handshake; *rest* was read behind its head.  No exception passes: the worker serves on."""
+    def _answer_handshake(self, pending: PendingSocket, head: RequestHead | None, rest: bytes) -> None:
+        """Answer a handshake; *rest* was read behind its head.  A defect is logged and answered with 500."""
         if head is None:
             self._refuse(pending, self._handshake.no_request, pending.peer, "")
             return
@@ -270,7 +269,7 @@ class RobotSockets:
             token = carried_token(authorization, offered)
             verdict = self._verdict(head, authorization, offered, source)
             self._recorder.record_verdict(verdict, source, token, self._handshake.keys)
-        except Exception as error:  # noqa: BLE001  the worker serves on
+        except Exception as error:  # noqa: BLE001  other robots are served on
             self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
         if isinstance(verdict, Accepted):
@@ -290,7 +289,7 @@ class RobotSockets:
         listener = Listener(self._dispatcher, verdict, pending.number)
         accepted = pending.accepted
         try:
-            # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
+            # By default the kernel buffers megabytes for a slow reader, which this process would not notice.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
             protocol = RobotProtocol(
                 listener, verdict.subprotocol, upgrade, rest,
@@ -329,9 +328,9 @@ class RobotSockets:
 
 
 class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
-    """The socket of one robot: passes nothing behind the first CLOSE to picows.
+    """The bytes of one robot's socket; passes nothing behind the first CLOSE frame to picows.
 
-    picows itself sends no pings and answers none: `RobotConnection` does.
+    picows sends no pings and answers none: `RobotConnection` answers them.
     """
 
     def __init__(
@@ -353,7 +352,7 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
             upgrade: The request that picows gets in place of the robot's.
             rest: Bytes that were read behind the robot's request.
             max_frame_bytes: A longer frame ends the connection.
-            poller: Reads on where a message is longer than one read.
+            poller: Reads the rest of a message that is longer than one read, after other sockets.
             on_end: Called when the socket is gone.
         """
         answer = picows.WSUpgradeResponseWithListener(_Upgrade(subprotocol), listener)

@@ -1,23 +1,28 @@
 """The channel between a worker and one sandbox: messages, and what the sandbox prints.
 
-Neither a slow nor a hostile sandbox can block the event loop or fill the worker's memory: the size of a
-message, its values and levels, and the number and length of printed lines have limits.
+A hostile service can send any message itself.  Neither it nor a slow one can block the event loop or fill the
+worker's memory: the size of a message, its values and levels, and the number and length of printed lines have
+limits, and `outcome_of` checks the form of each message.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 from asyncio import AbstractEventLoop
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeGuard
 
-from rse_pf.errors import RsePfError
+from rse_pf.errors import BadMessage, RsePfError, error_from_code
 from rse_pf.processes.ipc import FrameReader
+from rse_pf.server.sandbox.policy import SandboxReply
 from rse_pf.services.custom.output import OutputLines
 
-__all__ = ["IpcChannel"]
+__all__ = ["MAX_COMPUTE_MS", "IpcChannel", "is_ready", "outcome_of"]
 
+MAX_COMPUTE_MS = 86_400_000.0  # a longer time in a reply is malformed: no command takes a day
+_MAX_TEXT = 500  # characters of a failure's message and hint that reach the robot
 _READ_BYTES = 1 << 18
 _NO_MESSAGE = object()
 
@@ -140,3 +145,32 @@ class IpcChannel:
             return
         for line in self._lines.feed(text, self._loop.time()):
             self._on_line(line)
+
+
+def is_ready(message: object) -> bool:
+    """Return whether *message* reports that the sandbox has started."""
+    match message:
+        case [str(word)]:
+            return word == "ready"
+    return False
+
+
+def outcome_of(message: object) -> SandboxReply | RsePfError:
+    """Return the outcome of a request in *message*: a reply, or the typed failure of the service.
+
+    Raises:
+        BadMessage: Its parts have other types, or its time is not a number of milliseconds from 0 to
+            `MAX_COMPUTE_MS`.
+    """
+    match message:
+        case [True, value, (None | bytes()) as snapshot, compute_ms] if _is_time(compute_ms):
+            return SandboxReply(value, float(compute_ms), snapshot)
+        case [False, str(code), str(text), str(hint), compute_ms] if _is_time(compute_ms):
+            return error_from_code(code, text[:_MAX_TEXT], hint=hint[:_MAX_TEXT])
+    raise BadMessage("it sent a message of no known form")
+
+
+def _is_time(value: object) -> TypeGuard[float]:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return math.isfinite(value) and 0 <= value <= MAX_COMPUTE_MS

@@ -20,7 +20,7 @@ from rse_pf.errors import BadMessage, NotFound, RsePfError
 from rse_pf.identity import RobotId, state_name
 from rse_pf.processes.ipc import encode_message
 from rse_pf.server.ports import Log
-from rse_pf.server.sandbox.channel import IpcChannel
+from rse_pf.server.sandbox.channel import IpcChannel, is_ready, outcome_of
 from rse_pf.server.sandbox.circuit_breaker import Block
 from rse_pf.server.sandbox.policy import (
     Action,
@@ -37,7 +37,6 @@ from rse_pf.server.sandbox.policy import (
     SaveSnapshot,
     SendMessage,
 )
-from rse_pf.server.sandbox.replies import is_ready, outcome_of
 from rse_pf.server.sandbox.zygote_client import ZygoteClient
 from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.service import failure_of

@@ -12,7 +12,7 @@ from collections.abc import Callable
 __all__ = ["MIN_WAIT_S", "CpuThrottle"]
 
 MIN_WAIT_S = 0.002  # shorter waits cost as much CPU time as a small server may use
-_BURST_S = 0.02  # CPU seconds that may be used at once: some solves, so that a single command is not delayed
+_BURST_S = 0.02  # CPU seconds that may be used at once: some commands, so that a single one is not delayed
 
 
 class CpuThrottle:

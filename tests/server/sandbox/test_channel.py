@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import BadMessage, BadRequest
+from rse_pf.server.sandbox.channel import MAX_COMPUTE_MS, is_ready, outcome_of
 from rse_pf.server.sandbox.policy import SandboxReply
-from rse_pf.server.sandbox.replies import MAX_COMPUTE_MS, is_ready, outcome_of
 
 
 @pytest.mark.parametrize("compute_ms", [0, 0.0, 1.5, 7, MAX_COMPUTE_MS])
