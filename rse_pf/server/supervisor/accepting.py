@@ -1,8 +1,8 @@
-"""The robots' port of a server: accepts sockets, and passes on those that have begun to send.
+"""Accept the sockets of robots, and pass on those that have begun to send.
 
-To accept is cheap, a handshake is not.  A socket that has sent nothing waits here, among a bounded number and
-for a bounded time, and costs a worker nothing; the rate of accepts applies to those that have sent something.
-No byte is consumed here.
+To accept a socket is cheap, a handshake is not.  A socket that has sent nothing waits here for a bounded
+time, among a bounded number, and costs no worker anything.  ``serving.max_accepts_per_s`` limits the sockets
+that are passed on.  No byte is consumed here.
 """
 
 from __future__ import annotations
@@ -22,21 +22,17 @@ from rse_pf.server.gateway.rate_limits import HANDSHAKE_BURST
 
 __all__ = ["RobotAcceptor"]
 
-_ACCEPTS_AT_ONCE = 128
-"""Sockets accepted before a pause of `_ACCEPT_PAUSE_S`: 25,600 a second at the most."""
-_ACCEPT_PAUSE_S = 0.005
-_MIN_PAUSE_S = 0.01
-_REFUSED_PAUSE_S = 0.1
-"""After the system refused to accept: it has no descriptor left."""
-_MAX_READY = 1024
-"""Sockets that have begun to send and wait for their turn; above that no more are accepted."""
-_LISTEN_BACKLOG = 4096
-"""Connections that wait for accept; the kernel cuts it to net.core.somaxconn."""
+_ACCEPTS_AT_ONCE = 128  # sockets accepted before a pause, so that the event loop serves others
+_ACCEPT_PAUSE_S = 0.005  # that pause: at most 25,600 sockets a second are accepted
+_MIN_PAUSE_S = 0.01  # shortest pause for the rate of accepts, so that several sockets are passed on together
+_REFUSED_PAUSE_S = 0.1  # pause after the kernel refused to accept, because no descriptor is left
+_MAX_READY = 1024  # sockets that have begun to send and wait for the rate; no more are accepted beyond it
+_LISTEN_BACKLOG = 4096  # connections that wait for accept; the kernel reduces it to net.core.somaxconn
 
 _PEEK = socket.MSG_PEEK | socket.MSG_DONTWAIT
 
 Accepted = tuple[socket.socket, int, str]
-"""A socket, which one of the server it is, and the address of the other end."""
+"""A socket, its number on this server, and the address of the other end."""
 
 
 class RobotAcceptor:
@@ -151,7 +147,7 @@ class RobotAcceptor:
         self._silent.enter(accepted, functools.partial(self._drop, accepted), address)
 
     def _begin(self, accepted: Accepted) -> None:
-        """Queue *accepted* for its turn, because its first bytes have come, or its end."""
+        """Pass on or queue *accepted*, whose first bytes have come; drop it if it has ended instead."""
         assert self._silent is not None
         self._loop.remove_reader(accepted[0].fileno())
         self._silent.leave(accepted)
@@ -178,11 +174,11 @@ class RobotAcceptor:
 
     def _serve_ready(self, accepted: Accepted) -> None:
         """Pass on *accepted*, which has begun to send, or let it wait for the rate."""
-        if self._rate_pause is not None or not self._has_turn(accepted):
+        if self._rate_pause is not None or not self._try_to_pass_on(accepted):
             self._ready.append(accepted)
 
-    def _has_turn(self, accepted: Accepted) -> bool:
-        """Pass on *accepted* if the rate allows it, else plan when it does."""
+    def _try_to_pass_on(self, accepted: Accepted) -> bool:
+        """Pass on *accepted* and return True if the rate allows it; else set a timer and return False."""
         wait_s = self._rate.take(time.monotonic()) if self._rate.rate > 0 else 0.0
         if wait_s > 0:
             self.pauses += 1
@@ -193,10 +189,10 @@ class RobotAcceptor:
         return True
 
     def _pass_on_some(self) -> None:
-        """Pass on what the rate allows, in the order in which they began to send."""
+        """Pass on as many sockets as the rate allows, in the order in which they began to send."""
         self._rate_pause = None
         while self._ready:
             # One may have ended while it waited.
-            if self._has_begun(self._ready[0]) and not self._has_turn(self._ready[0]):
+            if self._has_begun(self._ready[0]) and not self._try_to_pass_on(self._ready[0]):
                 return
             self._ready.popleft()

@@ -1,8 +1,8 @@
-"""Replace a worker that native code ended, and refuse a robot whose bytes do that.
+"""Replace a worker that crashed in native code, and refuse a robot that causes such crashes.
 
-The spare processes that take over were forked with the workers, before any loop and thread.  After many
-crashes a successor begins later (`restart_delay_s`).  A server forks no further spares in its life: when they
-are used up, or a worker ends in another way, the server ends with its worker.
+Spare processes were forked with the workers, before any event loop and thread, and one of them takes the
+place of a crashed worker.  After several crashes it begins with an exponential delay (`restart_delay_s`).  No
+further spares are forked: when they are used up, or if a worker ends in another way, the server exits.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from rse_pf.server.supervisor.worker_handle import WorkerProcess
 
 __all__ = ["CrashRecovery", "restart_delay_s", "spare_plans"]
 
-_SPARES = 5
-"""Crashes that a server survives in its life: one process waits for each."""
-_PROMPT_RESTARTS = 2
-"""Crashes within `WINDOW_S` whose successors begin at once; one robot that causes as many is refused."""
+_SPARES = 5  # crashes that a server survives: a spare process waits for each
+_PROMPT_RESTARTS = 2  # crashes within `WINDOW_S` without a delay: a robot that causes as many is refused
 
 
 def restart_delay_s(crashes: int) -> float:
@@ -36,13 +34,13 @@ def restart_delay_s(crashes: int) -> float:
 
 
 def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
-    """Return the plans of the processes that wait beside the workers of *plans*."""
+    """Return the plans of the spare processes for the workers of *plans*."""
     spare = replace(plans[0], index=-1, is_spare=True)
     return [replace(spare, crash=CrashReport()) for _ in range(_SPARES)]
 
 
 class CrashRecovery:
-    """Counts the crashes of the workers of one server, and has the processes that wait for them."""
+    """Counts the crashes of the workers of one server, and holds its spare processes."""
 
     def __init__(
         self,
@@ -57,12 +55,12 @@ class CrashRecovery:
         """Replace nothing yet.
 
         Args:
-            workers: Of the server; one that crashed is replaced in this list.
-            spares: Processes that wait.
-            registry: Knows the robots of connections, and forgets those of a worker that ended.
-            trust: Has the keys that a worker begins with; None for those of the server's start.
-            log: Of the server.
-            records: Its audit log.
+            workers: The workers of the server; a crashed one is replaced in this list.
+            spares: Spare processes.
+            registry: Knows the robots of connections; those of an ended worker are removed from it.
+            trust: Has the keys for a new worker; None for the keys with which the server started.
+            log: The log of the server.
+            records: The audit log of the server.
         """
         self._workers, self._spares = workers, spares
         self._registry, self._trust, self._log, self._records = registry, trust, log, records

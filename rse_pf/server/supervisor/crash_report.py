@@ -1,8 +1,8 @@
-"""What a worker leaves behind when native code ends its process: which robot it computed for, and where.
+"""Find out after a crash in native code for which robot a worker was computing, and where.
 
-The report is memory that worker and supervisor share.  While a thread of the worker decodes messages of a
-connection or computes for it, the number of the connection is there; the traceback of the crash is written by
-`faulthandler`, whose handler costs nothing before.  Nobody is named for a crash at any other time.
+Worker and supervisor share the memory of the report.  While a thread of the worker decodes a message of a
+connection or computes for it, the number of the connection is in that memory.  `faulthandler` writes the
+traceback of the crash behind it, and costs nothing before.  A crash at any other time is charged to no robot.
 """
 
 from __future__ import annotations
@@ -25,18 +25,13 @@ from rse_pf.identity import RobotId
 __all__ = ["CRASH_SIGNALS", "Crash", "CrashReport"]
 
 CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
-"""How native code ends a process; an operator or the kernel uses other signals."""
-_MAX_THREADS = 4
-"""Threads of a worker that are recorded: event loop, solver and decoder are three."""
-_THREADS = _MAX_THREADS
-"""Index of the first word with the id of a thread; as many words before hold the numbers of connections."""
-_ENTRY = struct.Struct("@QH")
-_ENTRY_BYTES = 640
-"""Size of an entry: the number of a connection and the name of its robot, as JSON."""
-_ENTRIES = 128
-"""Connections whose robots are in the table; the registry of the supervisor knows those of older ones."""
-_TABLE = 8 * 2 * _MAX_THREADS
-"""Offset of the table of robots behind the words, in bytes."""
+"""Signals by which native code ends a process; operators and the kernel use others."""
+_MAX_THREADS = 4  # threads of a worker that are recorded: event loop, solver and decoder are three
+_THREADS = _MAX_THREADS  # index of the first word with a thread id; the words before hold connection numbers
+_ENTRY = struct.Struct("@QH")  # number of a connection, and length of its robot's name as JSON
+_ENTRY_BYTES = 640  # size of an entry with the name
+_ENTRIES = 128  # newest connections in the table of robots; the supervisor's registry has the older ones
+_TABLE = 8 * 2 * _MAX_THREADS  # offset of the table behind the words, in bytes
 _TEXT = mmap.PAGESIZE * -(-(_TABLE + _ENTRY_BYTES * _ENTRIES) // mmap.PAGESIZE)
 _MAX_TEXT_BYTES = 1 << 17
 _THREAD = re.compile(rb"Current thread 0x([0-9a-f]{1,16}) ")
@@ -45,10 +40,12 @@ _FRAME = re.compile(rb'File "([^"\n]{1,500})", line (\d{1,9}) in ([^\n]{1,200})'
 
 @dataclass(frozen=True, slots=True)
 class Crash:
-    """One crash: the number of the connection that was computed for, 0 if none was, and its robot.
+    """One crash.
 
-    ``robot`` is None if the connection is no recent one, or has no token; ``place`` is the innermost Python
-    function.
+    Attributes:
+        number: Number of the connection for which the thread worked; 0 for none.
+        robot: Its robot; None if the connection is not among the newest, or has no token.
+        place: File, line and name of the innermost Python function.
     """
 
     number: int
@@ -104,7 +101,7 @@ class CrashReport:
     # --- in the supervisor ---------------------------------------------------------------------------------
 
     def read(self) -> Crash:
-        """Return what is known of the crash; called when the worker has ended."""
+        """Return the crash; called when the worker has ended."""
         text = os.pread(self._file, _MAX_TEXT_BYTES, _TEXT)
         found = _THREAD.search(text)
         frame = None if found is None else _FRAME.search(text, found.end())
@@ -115,7 +112,7 @@ class CrashReport:
         return Crash(number, self._robot_of(number), place.decode(errors="replace"))
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         if self._file >= 0:
             self.of_loop.release()
             self._words.release()

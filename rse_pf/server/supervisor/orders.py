@@ -1,4 +1,4 @@
-"""What a supervisor orders its workers to do: one JSON line each on the control channel."""
+"""The orders of a supervisor to its workers: one JSON line each on the control channel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ReportOrder(msgspec.Struct, tag="report", tag_field="do", frozen=True):
 
 
 class DrainOrder(msgspec.Struct, tag="drain", tag_field="do", frozen=True):
-    """Ask every robot to move within *within_ms*, and tell when all are gone."""
+    """Ask every robot to move within *within_ms*, and report when all have left."""
 
     within_ms: float
 
@@ -31,33 +31,33 @@ class MigrateOrder(msgspec.Struct, tag="migrate", tag_field="do", frozen=True):
 
 
 class TrustOrder(msgspec.Struct, tag="trust", tag_field="do", frozen=True):
-    """Trust what *snapshot*, the text of a `TrustStore`, says from now on."""
+    """Verify tokens by *snapshot*, the text of a `TrustStore`, from now on."""
 
     snapshot: str
 
 
 class ReplaceOrder(msgspec.Struct, tag="replace", tag_field="do", frozen=True):
-    """End the *number*-th socket: its robot has a newer one."""
+    """Close the connection *number*: its robot has a newer one."""
 
     number: int
 
 
 class BlocksOrder(msgspec.Struct, tag="blocks", tag_field="do", frozen=True):
-    """Order an answer with this *number* that lists the blocks of circuit breakers and poison requests."""
+    """List the services and requests that are refused after crashes, in an answer with this *number*."""
 
     number: int
 
 
 class RobotsOrder(msgspec.Struct, tag="robots", tag_field="do", frozen=True):
-    """Order an answer with this *number* that lists the connected robots."""
+    """List the connected robots, in an answer with this *number*."""
 
     number: int
 
 
 class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
-    """Lift what is refused, and tell in an answer with this *number* what it was.
+    """Lift refusals after crashes, and list them in an answer with this *number*.
 
-    None stands for every service, everybody, and every robot of the tenant.
+    None stands for every service, every tenant, and every robot of the tenant.
     """
 
     number: int
@@ -67,7 +67,7 @@ class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
 
 
 class ReloadServicesOrder(msgspec.Struct, tag="reload-services", tag_field="do", frozen=True):
-    """Load the services folder anew; what cannot be loaded changes nothing, and the log says why."""
+    """Load the services folder again; if that fails, the services stay as they are, and it is logged."""
 
 
 class BanOrder(msgspec.Struct, tag="ban", tag_field="do", frozen=True):
@@ -78,10 +78,13 @@ class BanOrder(msgspec.Struct, tag="ban", tag_field="do", frozen=True):
 
 
 class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
-    """Take the place of worker *index*, which has crashed; the first order of a process that waits for one.
+    """Take the place of worker *index*, which has crashed: the first order to a spare process.
 
-    It begins after *wait_s*.  ``snapshot`` is the text of a `TrustStore`, "" for the keys of the server's
-    start; each robot in ``banned`` is refused for its number of seconds from then on.
+    Attributes:
+        index: The index of the worker.
+        wait_s: Seconds to wait before it begins.
+        snapshot: The text of a `TrustStore`; "" for the keys with which the server started.
+        banned: Robots that are refused, each with the number of seconds.
     """
 
     index: int
@@ -91,7 +94,7 @@ class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
 
 
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
-    """Wait at most *held_s* for commands that are held, close every socket, and end."""
+    """Wait at most *held_s* until the commands that are held are answered, close every socket, and exit."""
 
     held_s: float
 
@@ -120,5 +123,5 @@ def encode_order(order: WorkerOrder) -> bytes:
 
 
 def decode_order(line: bytes) -> WorkerOrder:
-    """Return the order of a line; raises msgspec.ValidationError for one that is none."""
+    """Return the order in *line*; raises msgspec.ValidationError if there is none."""
     return _DECODER.decode(line)

@@ -1,6 +1,6 @@
-"""What a worker tells its supervisor of single robots, many events in one message.
+"""Send events of single robots from a worker to its supervisor, several in one message.
 
-Each message wakes the supervisor, which costs more than what it says.  Order is kept, and nothing is lost.
+To wake the supervisor costs more CPU time than to handle an event.  The order is kept, and nothing is lost.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from typing import Any
 
 __all__ = ["RobotEvents"]
 
-_GATHER_S = 0.01
-_MAX_EVENTS = 500
-"""In one message; a line of the channel may have 1 MiB."""
+_GATHER_S = 0.01  # an event waits this long for others
+_MAX_EVENTS = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
 
 
 class RobotEvents:
-    """The events of one worker's robots; each waits at most 10 ms for others."""
+    """The events of the robots of one worker that wait to be sent."""
 
     def __init__(self, loop: AbstractEventLoop, say: Callable[..., None]) -> None:
         """Hold no event yet; *say* sends a message to the supervisor."""
@@ -26,13 +25,13 @@ class RobotEvents:
         self._held: list[dict[str, Any]] = []
 
     def add(self, **event: Any) -> None:
-        """Send *event* together with those that follow within 10 ms."""
+        """Send *event* together with those that follow within `_GATHER_S`."""
         if not self._held:
             self._loop.call_later(_GATHER_S, self.flush)
         self._held.append(event)
 
     def flush(self) -> None:
-        """Send what is held, now."""
+        """Send the waiting events now."""
         held, self._held = self._held, []
         for first in range(0, len(held), _MAX_EVENTS):
             self._say(event="robots", robots=held[first : first + _MAX_EVENTS])

@@ -1,6 +1,6 @@
-"""The robots of one worker as rows for an operator: who, since when, and what the last answer was.
+"""List the robots of one worker for an operator: names, time of connection, and result of the last command.
 
-Nothing of a command but the result of the last one is in a row; no token, no address.
+A row has no content of a command, no token and no address.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ from rse_pf.server.gateway.connection import RobotConnection
 
 __all__ = ["MAX_ROBOT_ROWS", "robot_rows"]
 
-MAX_ROBOT_ROWS = 500
-"""Told at once; all of a server's fit into one answer of its control port."""
+MAX_ROBOT_ROWS = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
 
 
 def robot_rows(connections: Iterable[RobotConnection], now: float) -> list[dict[str, Any]]:
     """Return a row for each robot that an operator sees, by tenant and name, as plain JSON values.
 
     Args:
-        connections: Of the worker.
-        now: Seconds, monotonic; ``connected_s`` is the age of the connection at that time.
+        connections: The connections of the worker.
+        now: Monotonic seconds; ``connected_s`` is the age of the connection at that time.
     """
     rows = [
         {

@@ -1,7 +1,8 @@
-"""The robots connected to one server; the newer connection of a robot replaces the older one.
+"""Register the robots that are connected to one server; the newer connection of a robot replaces the older.
 
-The order is that in which sockets were accepted, however late a worker reads a Hello.  A robot that is
-moving keeps its old connection until the move is over; its worker reports ``stays`` then.
+Connections are ordered by the acceptance of their sockets, however late a worker reads the Hello.  A robot
+that was asked to move keeps its old connection until its time to move is over; the worker then reports
+``stays``.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ __all__ = ["SessionRegistry"]
 
 
 class SessionRegistry:
-    """The sockets of every robot that is connected to one server."""
+    """The socket numbers of every robot that is connected to one server, with the worker of each."""
 
     def __init__(self) -> None:
         self._sockets: dict[RobotId, dict[int, WorkerProcess]] = {}
@@ -26,7 +27,7 @@ class SessionRegistry:
         return len(self._sockets)
 
     def robot_of(self, number: int) -> RobotId | None:
-        """Return whose connection *number* is, None if that is not known."""
+        """Return the robot of the connection *number*, None if it is not registered."""
         return next((robot for robot, sockets in self._sockets.items() if number in sockets), None)
 
     def forget(self, worker: WorkerProcess) -> None:
@@ -39,7 +40,7 @@ class SessionRegistry:
                 del self._sockets[robot]
 
     def handle(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
-        """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
+        """Handle the event of one socket that *worker* reports: ``arrived``, ``stays`` or ``left``."""
         robot, number, event = RobotId(*message["robot"]), message["number"], message["event"]
         sockets = self._sockets.setdefault(robot, {})
         if event == "arrived":

@@ -1,9 +1,9 @@
 """One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
 
-The supervisor accepts each robot and passes the socket, when it has begun to send, to the worker with the
-fewest robots.  It consumes no byte of a robot.  A worker that native code ended is replaced
-(`crash_recovery`); otherwise the server ends with its first worker that is lost, and the scale modifier
-replaces it.  A drain loses no command.
+The supervisor accepts the sockets of robots, and passes each one that has begun to send to the worker with
+the fewest robots.  It reads no byte of a robot.  A worker that crashed in native code is replaced
+(`crash_recovery`).  If a worker ends in another way, the server exits, and the scale modifier replaces it.  A
+drain loses no command.
 """
 
 from __future__ import annotations
@@ -62,17 +62,18 @@ from rse_pf.version import installed_version
 
 __all__ = ["serve"]
 
-_FRESH_S = 0.25
-_REPORT_S = 0.3
-_ROWS_S = 2.0
-_LEAVE_S = 3.0
-_MAX_MOVES = 10000
-_MAX_BLOCKS = 2000
-_MAX_ROBOTS = 1000
-_MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
-_EXIT_OK, _EXIT_LOST = 0, 1
-_PUBLIC_PAGES = ("/healthz", "/readyz")
-"""A load balancer asks for them, without a token."""
+_FRESH_S = 0.25  # reports of the workers are reused for this long, so that several readers cost one report
+_REPORT_S = 0.3  # a worker that does not report within this keeps its last report
+_ROWS_S = 2.0  # a worker that does not answer within this is counted as silent in the answer to the operator
+_LEAVE_S = 3.0  # workers have this long to close their sockets; then they are killed
+_MAX_MOVES = 10000  # robots of one migration: as many connections as one server has
+_MAX_BLOCKS = 2000  # rows in one answer of the control port
+_MAX_ROBOTS = 1000  # rows in one answer of the control port
+_MAX_SPREAD_S = 3600.0  # longest migration that an operator may ask for
+_MAX_DRAIN_WAIT_S = 3600.0  # longest wait before a drain that an operator may ask for
+_EXIT_OK = 0
+_EXIT_LOST = 1
+_PUBLIC_PAGES = ("/healthz", "/readyz")  # load balancers request them without a token
 
 
 def serve(
@@ -89,11 +90,11 @@ def serve(
     control_token: str | None = None,
     recorder: ServerRecorder | None = None,
 ) -> int:
-    """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
+    """Serve robots until a drain or a signal; call this in the main thread of a process.
 
     Args:
-        settings: What all servers of the platform share.  /healthz shows its digest.
-        placement: Addresses, workers and store of this server; None takes what *settings* say.
+        settings: The settings that all servers of the platform share; /healthz shows their digest.
+        placement: Addresses, workers and store of this server; None takes those of *settings*.
         keys: Public keys of robots' tokens, for the whole run; None only where ``auth.required`` is false.
         trust: Reads public keys, roster and deny list, now and periodically, instead of *keys*.
         server_id: Name of this server in every Welcome, Result and log line.
@@ -160,7 +161,7 @@ def serve(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Identity:
-    """By what a server is known: its id, the digest of its settings, its announcement, its control token."""
+    """Id of a server, digest of its settings, file of its announcement, and token of its control port."""
 
     server_id: str
     digest: str
@@ -170,7 +171,7 @@ class _Identity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Processes:
-    """The processes of a server beside the supervisor: workers, those that wait for a crash, other ids."""
+    """The processes of a server: workers, spare workers that wait for a crash, and ids of others."""
 
     workers: list[WorkerProcess]
     spares: list[WorkerProcess]
@@ -286,10 +287,10 @@ class _Supervisor:
     # --- robots --------------------------------------------------------------------------------
 
     def _pass_on(self, fd: int, number: int, peer: str) -> None:
-        """Send an accepted socket to the worker with the fewest."""
+        """Send an accepted socket to the worker with the fewest robots whose channel has room."""
         if min(self._workers, key=_load_of).give(fd, number, peer):
             return
-        for worker in sorted(self._workers, key=_load_of)[1:]:  # that one is behind
+        for worker in sorted(self._workers, key=_load_of)[1:]:  # the channel of the first one is full
             if worker.give(fd, number, peer):
                 return
         self._refused_full += 1
@@ -322,7 +323,12 @@ class _Supervisor:
             self._keep(self._drain(self._settings.serving.drain_wait_s))
 
     async def _drain(self, wait_s: float) -> None:
-        """Report not ready but accept, then ask all robots to move, finish what is held, and leave."""
+        """Drain the server without losing a command.
+
+        1. Report not ready for *wait_s* seconds, but accept: the load balancer needs this time.
+        2. Ask all robots to move to another server, and wait until they have.
+        3. Answer the commands that are held, close the sockets and exit.
+        """
         self._state = "draining"
         self._log.info("drain", wait_s=wait_s)
         self._records.note("server.drain", wait_s=wait_s)
@@ -335,7 +341,7 @@ class _Supervisor:
         await self._leave(self._settings.session.answer_timeout_s)
 
     async def _wait_empty(self) -> None:
-        """Wait until no worker has a robot, those that replace a crashed one among them."""
+        """Wait until no worker has a robot, also none that replaced a crashed worker meanwhile."""
         while waiting := [worker for worker in self._workers if not worker.empty.is_set()]:
             await waiting[0].empty.wait()
 
@@ -465,11 +471,11 @@ class _Supervisor:
         return json_reply(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
 
     async def _robots(self, ask: ControlRequest) -> ControlReply:
-        """Return the connected robots, at most `_MAX_ROBOTS` of them; ``count`` is the number of all."""
+        """Return at most `_MAX_ROBOTS` connected robots; ``count`` is the number of all."""
         return json_reply(await self._ask_rows("robots", RobotsOrder, _MAX_ROBOTS))
 
     async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
-        """Lift what is refused after crashes: all, or that of a service, a tenant, or a robot of a tenant."""
+        """Lift refusals after crashes: all, or those of a service, a tenant, or a robot of a tenant."""
         scope = {name: ask.query.get(name) for name in ("service", "tenant", "robot")}
         if not ask.is_local:
             return refused_reply(403, "forbidden", "unblock from the server's own machine")
@@ -520,7 +526,7 @@ class _Supervisor:
         return json_reply({"state": self._state}, status=202)
 
     async def _post_move(self, ask: ControlRequest) -> ControlReply:
-        """Ask robots to move; while an earlier migration is under way, no further robot is asked."""
+        """Ask robots to move, unless an earlier migration still runs."""
         try:
             robots = int(ask.query["robots"])
             spread_s = number_of(ask, "spread_s", 0.0, _MAX_SPREAD_S)
@@ -542,7 +548,8 @@ class _Supervisor:
         return json_reply({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
 
     def _migrate(self, robots: int, spread_s: float) -> tuple[int, float]:
-        """Order the workers to ask *robots* to move; return how many are asked, and the time that takes."""
+        """Order the workers to ask *robots* to move; return how many are asked, and within how many
+        seconds."""
         delays = plan(
             [worker.load for worker in self._workers], robots, spread_s=spread_s,
             moves_per_s=MOVES_PER_S, random=random.random,
@@ -558,7 +565,7 @@ class _Supervisor:
         return asked, round(last_s, 3)
 
     async def _merge_reports(self) -> dict[str, Any]:
-        """Return the numbers of all workers, at most a quarter second old; a silent worker's are older."""
+        """Return the sum of the workers' reports, which are at most `_FRESH_S` old if the workers answer."""
         async with self._reporting:
             if time.monotonic() - self._reported >= _FRESH_S:
                 await asyncio.gather(*(worker.ask_report(_REPORT_S) for worker in self._workers))
@@ -569,7 +576,7 @@ class _Supervisor:
         return merged
 
     def _cpu_s(self, gauges: Mapping[str, float]) -> float:
-        """Return the CPU seconds of the server and of its limited processes, which the workers report."""
+        """Return the CPU seconds of the server's processes; workers report those of limited processes."""
         running_s = sum(map(cpu_seconds, self._processes.pids())) + gauges.get("compute_cpu_s", 0.0)
         return round(running_s + self._crashes.cpu_s, 3)
 

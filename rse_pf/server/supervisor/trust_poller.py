@@ -1,6 +1,6 @@
-"""Read the access control store periodically, and send every worker what is new.
+"""Read keys, roster and deny list periodically, and send changes to every worker.
 
-What cannot be read stays as it was last known, and is logged once.
+After a failed read the last known state stays in force, and the problem is logged once.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ async def poll_trust(trust: TrustStore, workers: Sequence[WorkerProcess], log: L
 
 
 async def update_workers(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
-    """Read the store in a thread, log a problem that is new, and send the workers what is new."""
+    """Read the store in a thread, log a new problem, and send a change to the workers."""
     known = trust.problem
     is_new = await asyncio.to_thread(trust.refresh)
     if trust.problem not in ("", known):

@@ -1,4 +1,4 @@
-"""A worker as its supervisor sees it: a process, its load, and two channels.
+"""Control a worker from its supervisor: a process, its load, and two channels.
 
 Workers are forked after the supervisor's imports, which take most of the time of a start, and before its
 event loop and its threads.  A worker holds neither another worker's channels nor the listener.  No call
@@ -95,7 +95,7 @@ class WorkerProcess:
         self.load = 0
         self.is_ready = False
         self.cpu_s = 0.0
-        """CPU time that it took, known when it has ended."""
+        """CPU seconds of the process, known after it has ended."""
         self.crash = plan.crash
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
@@ -112,13 +112,13 @@ class WorkerProcess:
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
-        self._told_rows: asyncio.Future[dict[str, Any]] | None = None
+        self._rows: asyncio.Future[dict[str, Any]] | None = None
         self._rows_number = 0
 
     def exit_code(self, how: int = os.WNOHANG) -> int | None:
-        """Return how the process ended (negative: by which signal), None while it runs.
+        """Return the exit code of the process (negative for a signal), None while it runs.
 
-        With 0 for *how* it waits for the end.
+        With 0 for *how*, wait until the process has ended.
         """
         if self._exit_code is None:
             try:
@@ -131,7 +131,7 @@ class WorkerProcess:
         return self._exit_code
 
     def begin(self, order: BeginOrder) -> bool:
-        """Let a process that waits take the place of a worker; return whether it lives, then `connect`."""
+        """Let a spare process take the place of a worker, before `connect`; return False if it has ended."""
         data = encode_order(order)
         try:
             self._control.sendall(BEGIN_LENGTH.pack(len(data)) + data)
@@ -184,11 +184,11 @@ class WorkerProcess:
 
     async def ask_rows(self, order: RowsOrder, timeout_s: float) -> dict[str, Any] | None:
         """Return the worker's answer to *order*, None if there is none in time; one order at a time."""
-        self._told_rows = asyncio.get_running_loop().create_future()
+        self._rows = asyncio.get_running_loop().create_future()
         self._rows_number = order.number
         self.order(order)
-        await asyncio.wait([self._told_rows], timeout=timeout_s)
-        return self._told_rows.result() if self._told_rows.done() else None
+        await asyncio.wait([self._rows], timeout=timeout_s)
+        return self._rows.result() if self._rows.done() else None
 
     def kill(self) -> None:
         """Kill the process and close the channels; a second call does nothing."""
@@ -223,7 +223,7 @@ class WorkerProcess:
         elif message["event"] == "empty":
             self.empty.set()
         elif message["event"] == "rows":
-            waiting = self._told_rows
+            waiting = self._rows
             if waiting is not None and not waiting.done() and message["number"] == self._rows_number:
                 waiting.set_result(message)
         elif message["event"] == "robots":
@@ -250,7 +250,7 @@ class WorkerProcess:
 def _be_worker(
     plan: WorkerPlan, data: socket.socket, control: socket.socket, unshared: Sequence[socket.socket]
 ) -> NoReturn:
-    """Run the child until it exits; it never returns into the supervisor's code."""
+    """Run the child until it exits, so that it never returns into the code of the supervisor."""
     try:
         for inherited in unshared:
             inherited.close()
