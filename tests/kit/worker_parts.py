@@ -12,13 +12,13 @@ from rse_pf.auth.tokens import Claims, KeySet
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.processes.limited import LimitedProcesses
-from rse_pf.server.compute.lane import ComputeLane
 from rse_pf.server.compute.limited_services import LimitedServices
-from rse_pf.server.gateway.answers import Answers, EncodedAnswer
+from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.audit_recorder import AuditRecorder
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.dispatcher import Dispatcher
 from rse_pf.server.gateway.handshake import Accepted, HandshakePolicy
+from rse_pf.server.gateway.service_queues import LimitedQueue
 from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.log import JsonLog
@@ -94,30 +94,22 @@ class WorkerParts:
             recorder=AuditRecorder(self.clocks, loop=self.loop, tell=self.told.append, is_on=False),
         )
         updates = None if live_maps is None else live_maps(self.context, self.answers)
-        lane = None if processes is None else self._lane(processes)
+        limited = (
+            None
+            if processes is None
+            else LimitedQueue(self.context, self.answers, LimitedServices(self.context, processes))
+        )
         self.dispatcher = Dispatcher(
             self.context,
             answers=self.answers,
             token_watch=self.token_watch,
-            queues=[queue for queue in (*queues, updates, lane) if queue is not None],
+            queues=[queue for queue in (*queues, updates, limited) if queue is not None],
             updates=updates,
         )
         self.dispatcher.start()
         self.scheduler = self.dispatcher.stateless.scheduler
         self.admission = self.dispatcher.admission
         self.decoder = self.dispatcher.decoder
-
-    def _lane(self, processes: LimitedProcesses) -> ComputeLane[EncodedAnswer]:
-        return ComputeLane(
-            [service.name for service in self.registry if service.limited],
-            LimitedServices(self.context, processes),
-            threads=self.settings.serving.compute_processes,
-            loop=self.loop,
-            monotonic=self.clocks.monotonic,
-            encode=self.answers.encode,
-            send=self.answers.send,
-            send_refusal=self.answers.send_refusal,
-        )
 
     def join(
         self,

@@ -11,7 +11,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import TooFewCorrespondences
 from rse_pf.identity import RobotId
-from rse_pf.server.gateway.stateless_queue import StatelessQueue
+from rse_pf.server.gateway.service_queues import StatelessQueue
 from rse_pf.server.scheduling.scheduler import INLINE_BYTES
 from rse_pf.service import Registry
 from rse_pf.storage.object_store import MemoryStore

@@ -21,7 +21,7 @@ from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.handshake import Accepted
 from rse_pf.server.gateway.idle_timeouts import IdleTimeouts
 from rse_pf.server.gateway.rate_limits import CUT_OFF
-from rse_pf.server.gateway.stateless_queue import StatelessQueue
+from rse_pf.server.gateway.service_queues import StatelessQueue
 from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.ports import Wire, WorkerContext

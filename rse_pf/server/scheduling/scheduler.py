@@ -22,16 +22,7 @@ from rse_pf.limits.fair_queue import FairQueue
 from rse_pf.server.scheduling.command_queue import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.server.scheduling.overload import PAUSE_S, OverloadControl, WaitPerPosition, is_too_late
 
-__all__ = [
-    "BEHIND",
-    "BEHIND_HINT",
-    "INLINE_BYTES",
-    "QueuedCommand",
-    "RefusedCommand",
-    "Scheduler",
-    "behind_error",
-    "expired_error",
-]
+__all__ = ["BEHIND", "BEHIND_HINT", "INLINE_BYTES", "Scheduler", "behind_error", "expired_error"]
 
 BEHIND = "the server is behind with its work"
 BEHIND_HINT = "try again later; another server may have been added"

@@ -32,14 +32,14 @@ from rse_pf.identity import RobotId
 from rse_pf.processes.event_loop import event_loop_maker
 from rse_pf.processes.ipc import receive_bytes
 from rse_pf.processes.linux import die_with_parent, set_process_name
-from rse_pf.server.compute.lane import ComputeLane
 from rse_pf.server.compute.limited_services import LimitedServices, limited_processes
-from rse_pf.server.gateway.answers import Answers, EncodedAnswer
+from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.audit_recorder import AuditRecorder
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.dispatcher import Dispatcher
 from rse_pf.server.gateway.handshake import HandshakePolicy
 from rse_pf.server.gateway.migration import Migration
+from rse_pf.server.gateway.service_queues import LimitedQueue
 from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.jobs.manager import JobManager
 from rse_pf.server.jobs.process import spawner
@@ -74,7 +74,6 @@ from rse_pf.server.supervisor.orders import (
 )
 from rse_pf.server.supervisor.robot_events import RobotEvents
 from rse_pf.server.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
-from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, packaged_services
 from rse_pf.services.loading import load_services
 from rse_pf.storage.object_store import ObjectStore
@@ -230,7 +229,9 @@ class _Worker:
         queues: list[CommandQueue | None] = [
             self._sandboxes,
             self._live_maps,
-            self._compute(plan, context, registry, answers),
+            LimitedQueue(
+                context, answers, LimitedServices(context, limited_processes(plan.services, settings))
+            ),
             self._jobs(plan, answers) if settings.serving.max_running_jobs else None,
         ]
         self._dispatcher = Dispatcher(
@@ -251,21 +252,6 @@ class _Worker:
             workers=self._workers,
             new_name=self._new_name,
             recorder=self._recorder,
-        )
-
-    def _compute(
-        self, plan: WorkerPlan, context: WorkerContext, registry: Registry, answers: Answers
-    ) -> ComputeLane[EncodedAnswer]:
-        serving = plan.settings.serving
-        return ComputeLane(
-            [service.name for service in registry if service.limited],
-            LimitedServices(context, limited_processes(plan.services, plan.settings)),
-            threads=serving.compute_processes,
-            loop=self._loop,
-            monotonic=time.monotonic,
-            encode=answers.encode,
-            send=answers.send,
-            send_refusal=answers.send_refusal,
         )
 
     def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:
