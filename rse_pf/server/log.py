@@ -1,4 +1,4 @@
-"""Write the server's log: one JSON object a line, off the hot path.
+"""Write the server's log: one JSON object a line, in a thread of its own.
 
 Lines are collected in memory and written by a thread, so that a slow disk or a full pipe never stops the
 event loop; lines that do not fit are counted and dropped.  Payloads and tokens are never logged, and a
@@ -37,7 +37,7 @@ class JsonLog:
     def __init__(
         self, *, level: str, server: str, wall_clock: Callable[[], float], fd: int = 2, **about: str
     ) -> None:
-        """Write nothing yet; every line has the fields *about*, unless it has its own."""
+        """Write nothing yet; every line gets the fields *about* that it does not set itself."""
         self.dropped = 0
         self._about = {"server": server, **about}
         self._lowest = _LEVELS[level]
@@ -49,7 +49,7 @@ class JsonLog:
         self._writer = threading.Thread(target=self._write_on, name="log", daemon=True)
 
     def start(self) -> JsonLog:
-        """Begin to write lines, also those that were logged before; return this object."""
+        """Begin to write lines, also those that were logged before this call; return this object."""
         self._writer.start()
         return self
 
@@ -58,23 +58,23 @@ class JsonLog:
         return _LEVELS[level] >= self._lowest
 
     def debug(self, event: str, **fields: Any) -> None:
-        """Write what only developers need."""
+        """Log an event that only developers need."""
         self._line("debug", event, fields)
 
     def info(self, event: str, **fields: Any) -> None:
-        """Write what happened."""
+        """Log an event of normal operation."""
         self._line("info", event, fields)
 
     def warning(self, event: str, **fields: Any) -> None:
-        """Write what an operator should look at."""
+        """Log an event that an operator should look at."""
         self._line("warning", event, fields)
 
     def error(self, event: str, **fields: Any) -> None:
-        """Write a defect."""
+        """Log a defect."""
         self._line("error", event, fields)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write the lines that are left, for at most *timeout_s*."""
+        """Write the remaining lines, for at most *timeout_s* seconds."""
         self._over = True
         self._wake.set()
         self._writer.join(timeout_s)

@@ -1,7 +1,7 @@
-"""Count what a worker does, add the workers up, and render the sums for Prometheus.
+"""Count the work of each worker, add the counts of all workers, and render the sums for Prometheus.
 
-A worker only adds to plain numbers; the supervisor asks for a `snapshot`, merges, and renders.  No label
-contains the id of a robot.
+A worker only adds to plain numbers.  The supervisor requests a `snapshot` of each, merges and renders them.
+No label contains the name of a robot.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ GAUGE_HELP = {
     "subscriptions": "subscriptions of robots to live maps now",
     "updates": "updates of live maps that were sent to robots since the start",
     "updates_replaced": "updates of live maps that newer ones replaced before a slow reader got them",
-    "live_waiting": "commands that wait for the owner of a live map now",
+    "live_waiting": "commands that wait for the map server of a live map now",
     "recording_dropped": "messages that were not recorded because the recorder was too slow or has ended",
     "ready": "whether the server accepts robots: 1, or 0 while it starts or drains",
     "accept_pauses": "pauses because sockets began to send faster than max_accepts_per_s",
@@ -60,10 +60,10 @@ GAUGE_HELP = {
     "control_refused": "requests to the control port that were refused for lack of its token",
 }
 """What each gauge means; a new gauge needs a line here."""
-MAX_TENANTS, OTHER_TENANTS = 100, "(others)"
-"""A worker counts so many tenants by name, the first that it sees, and all others together."""
-_GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")
-_RECENT_S = 1.0
+MAX_TENANTS = 100  # tenants that a worker counts by name, so that the number of labels is bounded
+OTHER_TENANTS = "(others)"  # label of all further tenants together
+_GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")  # merged by maximum; others are added
+_RECENT_S = 1.0  # length of the two intervals of `LongestRecently`
 
 
 class Metrics:
@@ -80,19 +80,19 @@ class Metrics:
         self.bytes_out = 0
         self.gauges: dict[str, float] = {}
         self.tenant_cpu_s: dict[str, dict[str, float]] = {"commands": {}}
-        """Seconds of computing, by what computed and by tenant."""
+        """CPU seconds by kind of work and by tenant."""
         self._commands_s = self.tenant_cpu_s["commands"]
         self._tenants: set[str] = set()
 
     def set_cpu(self, kind: str, seconds: Mapping[str, float]) -> None:
-        """Replace what was counted of a kind by what its processes have taken so far, by tenant."""
+        """Replace the CPU *seconds* of a kind of work by those of its processes so far, by tenant."""
         taken: defaultdict[str, float] = defaultdict(float)
         for tenant, taken_s in seconds.items():
             taken[self._label(tenant)] += taken_s
         self.tenant_cpu_s[kind] = taken
 
     def _label(self, tenant: str) -> str:
-        """Return the name by which a tenant is counted from now on."""
+        """Return the label under which *tenant* is counted from now on."""
         if tenant not in self._tenants and len(self._tenants) >= MAX_TENANTS:
             return OTHER_TENANTS
         self._tenants.add(tenant)
@@ -101,7 +101,15 @@ class Metrics:
     def count_answer(
         self, service: str, result: str, duration_s: float, tenant: str = "", computed_s: float = 0.0
     ) -> None:
-        """Count a final answer; *result* is ``ok`` or a failure code, *computed_s* is charged to *tenant*."""
+        """Count a final answer.
+
+        Args:
+            service: Name of the service.
+            result: ``ok`` or the code of a failure.
+            duration_s: Seconds from the arrival of the command to its answer.
+            tenant: The tenant of the robot.
+            computed_s: CPU seconds, added to those of *tenant*.
+        """
         if computed_s:
             try:
                 self._commands_s[tenant] += computed_s
@@ -135,21 +143,21 @@ class Metrics:
 
 
 class LongestRecently:
-    """The longest of the durations noted in the last one to two seconds, in constant space."""
+    """The longest duration of the last one to two seconds, in constant memory."""
 
     def __init__(self) -> None:
         self._second = -1
         self._longest_s = [0.0, 0.0]
 
     def note(self, duration_s: float, now: float) -> None:
-        """Take one more, noted at *now* (s, monotonic)."""
+        """Add a duration that ended at *now* (monotonic seconds)."""
         if int(now // _RECENT_S) != self._second:
             self._turn(now)
         if duration_s > self._longest_s[1]:
             self._longest_s[1] = duration_s
 
     def longest_s(self, now: float) -> float:
-        """Return the longest, 0 if nothing was noted recently."""
+        """Return the longest duration, 0 if there was none recently."""
         self._turn(now)
         return max(self._longest_s)
 
@@ -161,7 +169,7 @@ class LongestRecently:
 
 
 def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the sum of the workers' snapshots; ages and lags are the worst of all."""
+    """Return the sum of the workers' snapshots; waits and lags are the greatest of all workers."""
     requests: Counter[tuple[str, str]] = Counter()
     sums: dict[str, Counter[str]] = {
         name: Counter() for name in ("shed", "handshakes", "closed", "duration_sum_s", "bytes", "gauges")
@@ -192,7 +200,7 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def tenant_cpu_s(merged: Mapping[str, Any]) -> dict[str, float]:
-    """Return the seconds of computing of each tenant, whatever computed, the largest first."""
+    """Return the CPU seconds of each tenant for all kinds of work, the largest first."""
     taken: defaultdict[str, float] = defaultdict(float)
     for tenant, _, taken_s in merged["tenant_cpu_s"]:
         taken[tenant] += taken_s
@@ -200,7 +208,7 @@ def tenant_cpu_s(merged: Mapping[str, Any]) -> dict[str, float]:
 
 
 def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
-    """Return the workers' reports on sandboxes, added up; zero without installed services."""
+    """Return the sum of the workers' reports on sandboxes; zero without installed services."""
     reports = [snapshot["isolation"] for snapshot in snapshots if snapshot and "isolation" in snapshot]
     counts: Counter[str] = Counter()
     for report in reports:

@@ -1,8 +1,8 @@
 """Replace references to stored objects in a payload by their bytes before a service is called.
 
 Where a request type declares ``bytes``, a robot may send ``{"object": DIGEST}`` instead, for an object that
-it stored with the data service.  A robot reaches only its own objects: a missing object and one of another
-robot give the same error.  A service gets only bytes whose digest is right.
+it has stored in the data service.  A robot can refer only to its own objects: a missing object and an object
+of another robot give the same error.  A service gets only bytes that match the digest.
 """
 
 from __future__ import annotations
@@ -30,12 +30,9 @@ __all__ = ["ObjectRefs", "named_in", "resolve", "takes_objects"]
 
 _KEY = "object"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-MAX_OBJECTS_PER_COMMAND = 64
-"""Stored objects that one command may refer to; each costs a request to the store."""
-# Size of all objects of one command together, which its process holds in memory beside the command.
-MAX_OBJECT_BYTES_PER_COMMAND = 128 << 20
-_MAX_DEPTH = 8
-"""Below this depth, and in recursive types, references are not looked for."""
+MAX_OBJECTS_PER_COMMAND = 64  # stored objects in one command: each costs a request to the store
+MAX_OBJECT_BYTES_PER_COMMAND = 128 << 20  # all objects of one command: its process holds them in memory
+_MAX_DEPTH = 8  # levels of a request type in which references are looked for; recursive types end there
 
 
 def takes_objects(request_type: type[Any]) -> bool:
@@ -58,7 +55,7 @@ def resolve(
     robot: RobotId,
     store: ObjectStore,
 ) -> Any:
-    """Return *payload* with the robot's own objects in the place of the references; blocks for the store.
+    """Return *payload* with the robot's own objects in the place of the references; blocks on the store.
 
     A payload without references is returned as it is, and the store is not asked.
 
@@ -109,7 +106,7 @@ class ObjectRefs:
         return shape is not None and any(True for _ in _references(shape, command.payload))
 
     def resolve_references(self, command: Command, registry: Registry, robot: RobotId) -> Command:
-        """Return *command* with the bytes that its payload refers to; blocks for the store.
+        """Return *command* with the bytes that its payload refers to; blocks on the store.
 
         Args:
             command: As decoded from the wire; not changed.
@@ -132,7 +129,7 @@ class ObjectRefs:
     def store_large_reply(
         self, result: Result, too_large: Failure, robot: RobotId, claims: Claims | None
     ) -> Result | Failure:
-        """Store the reply of *result*, which is too large for a message; blocks for the store.
+        """Store the reply of *result*, which is too large for a message; blocks on the store.
 
         Args:
             result: Of the service.

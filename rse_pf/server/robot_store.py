@@ -1,7 +1,7 @@
-"""The object store as a backend server uses it: written within a robot's quota.
+"""Store objects for robots in a backend server, within the quotas of robot and tenant.
 
-The quota is that of the data service: the robot's own in the roster, or else ``data.quota_bytes``.
-Nothing is removed to make an object fit.
+The quota of a robot is its own one in the roster, or else ``data.quota_bytes``, as in the data service.  No
+object is removed to make room for another.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Compute a command of a limited service in a process that is killed at the deadline of the command.
 
-What a command needs beyond its limits costs its own robot: the answer says so, and a robot whose commands
-ended two processes is kept from these services for a while.
+A command that exceeds a limit fails, and its failure names the limit.  A robot whose commands ended two
+processes is refused these services for a while (`CrashRecord`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from rse_pf.wire import Command, Failure, Result
 
 __all__ = ["LimitedServices", "limited_processes"]
 
+# A command that used this much CPU time and was not computed by its deadline counts as a crash.  Otherwise
+# its robot could occupy the processes all the time.  A command with a shorter deadline does not count.
 _LONG_WORK_S = 2.0
-"""A command that used this much CPU time and did not end by its deadline counts like a crash: its robot could
-take all the time of the processes otherwise.  A command that was given less time does not count."""
 
 
 def limited_processes(services: str, settings: PlatformSettings) -> LimitedProcesses:
@@ -65,15 +65,15 @@ class LimitedServices:
         return failure_of(failure, queued.command, server=self._context.server_id)
 
     def blocked_robots(self, now: float) -> int:
-        """Return how many robots are refused now."""
+        """Return how many robots are refused at *now* (monotonic seconds)."""
         return len(self._crashes.blocked(now))
 
     def cpu_s(self) -> float:
-        """Return the CPU seconds of all processes so far; less again after a template was lost."""
+        """Return the CPU seconds of all processes so far; less again after the fork server has restarted."""
         return sum(map(cpu_seconds, self._processes.pids()))
 
     def close(self) -> None:
-        """End all processes; commands that are under way are answered with WorkerLost."""
+        """End all processes; commands that are computed now are answered with WorkerLost."""
         self._processes.close()
 
     def _compute(self, queued: QueuedCommand) -> Result | Failure:

@@ -1,6 +1,7 @@
-"""What runs in a process of limited services: read the objects of one command, dispatch it, encode the reply.
+"""Code of a process for limited services: read the objects of one command, call the service, encode the
+reply.
 
-The process reads stored objects itself, so that the worker never holds a map.
+The process reads stored objects itself, so that the worker never holds a map in memory.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Encode the answers to commands, write them to the robots' connections, count them and log them.
+"""Encode the answers to commands, write them to the connections of robots, count them and log them.
 
-Every admitted command is answered here exactly once, whether the scheduler, a sandbox or a job computed it.
-Neither a payload nor a token reaches the log.
+Every admitted command is answered here exactly once, whether this worker, a sandbox, a job or a map server
+computed it.  Neither a payload nor a token reaches the log.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["Answers", "EncodedAnswer"]
 
 _UNKNOWN = "unknown"
 _FREQUENT = ("ok", Busy.code, "stale")
-"""Results that come hundreds of times a second: counted, and logged for developers only."""
+"""Results of which there are hundreds in a second: they are counted, and logged at level debug only."""
 
 
 class EncodedAnswer(msgspec.Struct, frozen=True):
@@ -47,7 +47,7 @@ class Answers:
         Args:
             context: The clocks, log, metrics and settings of the worker.
             registry: The services that `compute` calls.
-            services: Names of all services of this server, installed ones included; others share one label.
+            services: Names of all services of this server, also installed ones; others share one label.
             objects: Puts stored objects into payloads, and large replies into the store.
         """
         self.objects = objects
@@ -65,13 +65,13 @@ class Answers:
         self._logs_frequent = context.log.writes("debug")
 
     def offer(self, services: frozenset[str]) -> None:
-        """Take the names of all services of this server anew."""
+        """Replace the names of all services of this server."""
         self._services = services
 
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
         """Call the service and encode its answer.
 
-        It may run in the event loop or in a thread, because it changes nothing that they share.
+        This may run in the event loop or in a thread: it changes no state that they share.
         """
         before = self._crash.compute_for(queued.owner.number)
         try:
@@ -92,7 +92,7 @@ class Answers:
         return self._encode_fitting(queued, message)
 
     def _unknown_service(self, queued: QueuedCommand) -> RsePfError:
-        """Return the error of a service that is not offered; it names the services that the token allows."""
+        """Return the error of a service that does not exist; it names the services that the token allows."""
         owner: RobotConnection = queued.owner
         scopes = () if owner.claims is None else owner.claims.scopes
         offered = [name for name in self.registry.names if scopes_allow(scopes, f"services:{name}")]
@@ -115,9 +115,9 @@ class Answers:
         return self.encode(queued, message, started)
 
     def encode(self, queued: QueuedCommand, message: Result | Failure, started_s: float) -> EncodedAnswer:
-        """Return *message*, computed since *started_s*, as it is sent; runs where `compute` may run.
+        """Encode *message*, whose computation began at *started_s*; runs where `compute` may run.
 
-        Blocks for the store if the reply is too large for a message.
+        Blocks on the object store if the reply is too large for a message.
         """
         if isinstance(message, Result):
             message = msgspec.structs.replace(
@@ -129,9 +129,9 @@ class Answers:
         return self._encode_fitting(queued, message)
 
     def send(self, answer: EncodedAnswer, now: float, *, counts_cpu: bool = True) -> None:
-        """Write *answer*, unless its robot is gone; count and log it in any case.
+        """Write *answer*, unless its robot has disconnected; count and log it in any case.
 
-        With *counts_cpu* its tenant is charged with the time that it was computed for.
+        With *counts_cpu* the time of its computation is added to the CPU seconds of its tenant.
         """
         queued, message = answer.queued, answer.message
         if isinstance(message, Result):
@@ -148,7 +148,7 @@ class Answers:
         connection.tap.observe_answer(answer.data, queued.command, message)
         connection.commands += 1
         connection.last_result = code
-        weak = _weakness(message)  # is logged as a failure is: an operator wants to know which poses are bad
+        weak = _weakness(message)  # logged at the level of failures, since operators look for weak poses
         if code in _FREQUENT and not weak and not self._logs_frequent:
             return
         log = self._context.log
@@ -163,7 +163,7 @@ class Answers:
             )  # fmt: skip
 
     def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
-        """Send the answer of a sandbox, a job or a live map, which count their time themselves."""
+        """Send the answer of a sandbox, a job or a live map, which count their CPU seconds themselves."""
         now = self._context.clocks.monotonic()
         if isinstance(message, Result):
             # A job does not say when it began, only how long it took.
@@ -175,7 +175,7 @@ class Answers:
         self.send(self._encode(queued, message), now, counts_cpu=False)
 
     def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
-        """Answer a command that ends without compute."""
+        """Answer a command that is not computed."""
         self._context.metrics.shed[refusal.reason] += 1
         self.send(self._encode_failure(refusal.queued, refusal.error), now)
 
@@ -187,14 +187,14 @@ class Answers:
         refusal: UnreadRefusal,
         retry_after_ms: float,
     ) -> None:
-        """Answer a message that is not decoded.
+        """Answer a message that is refused before it is decoded.
 
         Args:
-            connection: Of the robot.
-            envelope: Which command the message is, if that is known.
-            size_bytes: Its length.
-            refusal: Why it is refused.
-            retry_after_ms: When the robot may try again.
+            connection: The connection of the robot.
+            envelope: Id and service of its command, None if they cannot be read.
+            size_bytes: Length of the message.
+            refusal: The reason of the refusal.
+            retry_after_ms: Milliseconds after which the robot may send again.
         """
         session = connection.session
         assert session is not None
@@ -230,8 +230,7 @@ class Answers:
         )  # fmt: skip
 
     def label(self, service: str) -> str:
-        """Return the name of *service* for metrics and log, the same for all that this server does not
-        offer."""
+        """Return the name of *service* for metrics and log: ``unknown`` if this server does not offer it."""
         return service if service in self._services else _UNKNOWN
 
     def _encode_fitting(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:

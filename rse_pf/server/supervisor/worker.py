@@ -1,8 +1,8 @@
 """One worker process, forked by the supervisor (`worker_handle`).
 
 Accepted sockets arrive as descriptors on the data channel, orders (`orders`) on the control channel.  A
-worker ends with its supervisor, by the parent-death signal and by the end of its control channel, and
-ignores the signals of a terminal or a service manager: they are for the supervisor.
+worker exits with its supervisor, by the parent-death signal and at the end of its control channel.  It
+ignores the signals of a terminal or a service manager, which are for the supervisor.
 """
 
 from __future__ import annotations
@@ -82,27 +82,23 @@ from rse_pf.wire.server_session import CLOSE_RATE
 __all__ = ["BEGIN_LENGTH", "HANDOVER", "WorkerPlan", "repeat_for", "run_worker"]
 
 HANDOVER = struct.Struct("!Q46s")
-"""A socket's number and the address of its peer, which travel with its descriptor."""
+"""The number of a socket and the address of its peer, sent together with its descriptor."""
 BEGIN_LENGTH = struct.Struct("!I")
-"""Stands before the `BeginOrder` of a process that waits."""
+"""Length in bytes of the `BeginOrder` that follows it on the control channel of a spare process."""
 _DESCRIPTOR = struct.Struct("@i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_DESCRIPTOR.size)
 _T = TypeVar("_T")
-_TAKE_S = 0.0005
-"""New sockets are taken for so long in one round of the event loop; then it serves robots before the next."""
-_POLL_S = 0.01
-_GATHER_S = 0.01
-"""Each message to the supervisor wakes it, which costs more than what it says."""
-_MAX_LINE_BYTES = 1 << 26
-"""A `TrustOrder` names every robot that is enrolled."""
-_CLOSE_TIMEOUT_S = 1.0
-_MAX_BLOCKS = 500
-"""Told at once; an operator reads no more."""
+_TAKE_S = 0.0005  # for new sockets in one round of the event loop, so that robots are served in between
+_POLL_S = 0.01  # between two looks whether all connections or commands have ended
+_GATHER_S = 0.01  # ended sockets are reported together: each message wakes the supervisor
+_MAX_LINE_BYTES = 1 << 26  # longest order: a `TrustOrder` names every enrolled robot
+_CLOSE_TIMEOUT_S = 1.0  # for closing live maps, and then connections, when the worker exits
+_MAX_BLOCKS = 500  # rows of refusals in one message to the supervisor: an operator reads no more
 
 
 @dataclass(frozen=True)
 class WorkerPlan:
-    """What a worker knows when it is forked; it checks tokens with ``keys`` until a `TrustOrder` comes."""
+    """What a worker gets when it is forked; it verifies tokens by ``keys`` until the first `TrustOrder`."""
 
     settings: PlatformSettings
     keys: KeySet | None
@@ -129,7 +125,7 @@ def repeat_for(seconds: float, step: Callable[[], bool], clock: Callable[[], flo
 
 
 def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) -> None:
-    """Serve robots until the worker is told to leave or its supervisor is gone."""
+    """Serve robots until a `LeaveOrder`, or until the supervisor has exited."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if not die_with_parent(plan.supervisor):
@@ -155,7 +151,7 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
 
 
 def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
-    """Return the order of a process that waits; None when its supervisor is gone."""
+    """Wait for the order that starts a spare process and return it; None if the supervisor has exited."""
     head = receive_bytes(control, BEGIN_LENGTH.size)
     size = BEGIN_LENGTH.unpack(head)[0] if len(head) == BEGIN_LENGTH.size else 0
     line = receive_bytes(control, size)
@@ -164,7 +160,7 @@ def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
 
 
 def _plan_of(plan: WorkerPlan, order: BeginOrder) -> WorkerPlan:
-    """Return the plan of a process that takes the place of a worker."""
+    """Return the plan of a spare process that takes the place of a worker."""
     keys = key_set_from_snapshot(order.snapshot) if order.snapshot and plan.keys is not None else plan.keys
     return replace(plan, index=order.index, keys=keys)
 
@@ -255,7 +251,7 @@ class _Worker:
         )
 
     def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:
-        """Return the services that are installed; of a folder that is followed, none if it is damaged."""
+        """Return the installed services; if ``services.follow`` is set, a damaged folder counts as empty."""
         published = packaged_services() if chosen.published else []
         if not chosen.folder:
             return published
@@ -312,7 +308,7 @@ class _Worker:
         )
 
     async def _reload_services(self) -> None:
-        """Load the services folder anew, which may take seconds: every file is compared with its pin."""
+        """Load the services folder again, which may take seconds: every file is compared with its digest."""
         chosen = self._dispatcher.context.settings.services
         if self._sandboxes is None or not chosen.follow:
             return
@@ -360,7 +356,7 @@ class _Worker:
         self._robot_events.flush()
         self._dispatcher.context.tap.flush()
         self._log.close()
-        os._exit(0)  # nobody waits for the sockets and threads that are left
+        os._exit(0)  # without waiting for the remaining sockets and threads
 
     def _obey(self, order: WorkerOrder) -> None:
         match order:
@@ -368,7 +364,7 @@ class _Worker:
                 self._say(event="report", report=self._report())
             case DrainOrder():
                 self._dispatcher.move_all("drain", order.within_ms)
-                self._keep(self._tell_when_empty())
+                self._keep(self._report_when_empty())
             case MigrateOrder():
                 self._migration.begin(order.delays_s, order.within_ms)
             case BanOrder():
@@ -378,14 +374,14 @@ class _Worker:
             case ReplaceOrder():
                 self._token_watch.replace(order.number)
             case BlocksOrder():
-                self._tell_blocks(order.number, [] if self._sandboxes is None else self._sandboxes.blocks())
+                self._send_blocks(order.number, [] if self._sandboxes is None else self._sandboxes.blocks())
             case RobotsOrder():
                 rows = robot_rows(self._dispatcher.connections, time.monotonic())
-                self._tell_rows(order.number, len(rows), rows[:MAX_ROBOT_ROWS])
+                self._send_rows(order.number, len(rows), rows[:MAX_ROBOT_ROWS])
             case UnblockOrder(number, service, tenant, robot):
                 sandboxes = self._sandboxes
                 lifted = [] if sandboxes is None else sandboxes.unblock(service, tenant, robot)
-                self._tell_blocks(number, lifted)
+                self._send_blocks(number, lifted)
             case ReloadServicesOrder():
                 self._keep(self._reload_services())
 
@@ -400,13 +396,13 @@ class _Worker:
         report["gauges"]["moved"] = float(self._migration.asked)
         return report
 
-    def _tell_blocks(self, number: int, blocks: list[Block]) -> None:
-        self._tell_rows(number, len(blocks), [asdict(block) for block in blocks[:_MAX_BLOCKS]])
+    def _send_blocks(self, number: int, blocks: list[Block]) -> None:
+        self._send_rows(number, len(blocks), [asdict(block) for block in blocks[:_MAX_BLOCKS]])
 
-    def _tell_rows(self, number: int, count: int, rows: list[dict[str, Any]]) -> None:
+    def _send_rows(self, number: int, count: int, rows: list[dict[str, Any]]) -> None:
         self._say(event="rows", number=number, count=count, rows=rows)
 
-    async def _tell_when_empty(self) -> None:
+    async def _report_when_empty(self) -> None:
         while self._dispatcher.connections:
             await asyncio.sleep(_POLL_S)
         self._say(event="empty")
@@ -448,7 +444,8 @@ class _Worker:
             self._loop.call_later(_GATHER_S, self._flush_ends)
 
     def _flush_ends(self) -> None:
-        """Send the supervisor one byte for each socket that ended, so that it knows this worker's load."""
+        """Send the supervisor one byte for each socket that ended, so that it can count this worker's
+        load."""
         self._flushing = False
         try:
             self._ended -= self._data.send(b"e" * self._ended)
