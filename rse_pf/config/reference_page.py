@@ -14,11 +14,13 @@ _HEAD = """# Settings
 `make docs` writes this page from `rse_pf/config/settings.py`. Override a setting in `cdk.json`:
 `{"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}`. `rse-pf settings` prints the values in force.
 """
-_TABLE = "| Setting | Default | Unit | Allowed | Source | Meaning |\n|---|---|---|---|---|---|\n"
+_TABLE = "| Setting | Default | Allowed | Meaning |\n|---|---|---|---|\n"
+_OWN_CHOICE = "ours"
+"""The source of a value that this project chose; the page names all other sources."""
 
 
 def settings_page() -> str:
-    """Return the page: every setting with default, unit, range, source and meaning."""
+    """Return the page: every setting with default, unit, range and meaning, and the source of a value."""
     page, group = _HEAD, ""
     for row in setting_rows():
         if row.group != group:
@@ -26,11 +28,9 @@ def settings_page() -> str:
             page += f"\n## {group}\n\n{getattr(PlatformSettings(), group).__doc__}\n\n{_TABLE}"
         cells = (
             f"`{row.name}`",
-            f"`{json.dumps(row.default)}`",
-            row.unit,
+            f"`{json.dumps(row.default)}` {row.unit}".rstrip(),
             _allowed(row),
-            row.source,
-            row.doc,
+            row.doc if row.source == _OWN_CHOICE else f"{row.doc} (source: {row.source})",
         )
         page += "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
     return page
