@@ -56,10 +56,9 @@ __all__ = ["DataServer"]
 
 _ANONYMOUS = Claims(robot=RobotId("", ""), token_id="", issued_s=0.0, expires_s=0.0, key_id="")
 _PROBES = ("/data/healthz", "/data/readyz")
-_RETRY_AFTER_MS = 1000.0
+_RETRY_AFTER_MS = 1000.0  # while the server has no keys: they are read again within this time
 _REQUEST_TIMEOUT = 408
-_REFUSAL_PAUSE_S = 0.25
-"""A refusal costs half a millisecond: a robot that ignores it would use up the server with refusals."""
+_REFUSAL_PAUSE_S = 0.25  # delay of a refusal, so that a robot that ignores it does not overload the server
 
 
 class DataServer:
@@ -184,7 +183,7 @@ class DataServer:
         try:
             self._limits.begin(request, claims.robot, route.cost, self._clock(), has_body=has_body)
         except Busy:
-            await self._pause(_REFUSAL_PAUSE_S)  # each of its connections asks again only after this
+            await self._pause(_REFUSAL_PAUSE_S)  # its connections send no further request before this
             raise
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest(
@@ -268,9 +267,9 @@ async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
         size = int(headers["Content-Length"])
         async for piece in body:
             sent += len(piece)
-            # Who has the last byte may send the next request at once.
+            # A client that has the last byte may send its next request at once.
             await send({"type": "http.response.body", "body": piece, "more_body": is_open or sent < size})
-            await asyncio.sleep(0)  # lets other requests run where sending never waits
+            await asyncio.sleep(0)  # serve other requests in between, also if sending never waits
     if is_open:  # the connection ends after it
         if reply.status != _REQUEST_TIMEOUT:
             await request.discard()

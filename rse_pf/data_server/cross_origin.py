@@ -16,11 +16,11 @@ _SENT = (
     "authorization, content-type, if-match, if-none-match, if-range, range, upload-offset, x-accept-direct"
 )
 _EXPOSED = "content-range, etag, retry-after, upload-offset"
-_PREFLIGHT_LIFE_S = 600
+_PREFLIGHT_LIFE_S = 600  # a browser does not ask again for this time
 
 
 def is_preflight(request: HttpRequest) -> bool:
-    """Return whether a browser asks what a page of another origin may send."""
+    """Return whether *request* is a CORS preflight request of a browser."""
     named = request.headers
     return request.method == "OPTIONS" and "origin" in named and "access-control-request-method" in named
 

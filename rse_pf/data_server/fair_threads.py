@@ -1,8 +1,8 @@
-"""Threads that work for robots in turn, so that the slow work of one robot delays no other for long.
+"""A thread pool that is fair between tenants and robots, so that slow work of one robot delays no other.
 
-The order is that of `FairQueue`.  A robot never has more than one thread.  If there are several, the last
-free one goes to a tenant that has none: two tenants with slow work do not delay a third.  Work that is no
-longer wanted is not started; work that runs ends at its next call of `check_wanted`.
+Work starts in the order of `FairQueue`, and a robot has at most one thread.  The last free thread of several
+goes to a tenant that has none, so that two tenants with slow work do not delay a third.  Work whose robot has
+disconnected is not started; running work ends at its next call of `check_wanted`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from rse_pf.limits.fair_queue import FairQueue
 __all__ = ["FairThreads", "check_wanted", "while_wanted"]
 
 _T = TypeVar("_T")
-_THREADS = 8
-_MAX_PER_TENANT = 6  # threads of one tenant: of eight threads, two are left for the others
+_THREADS = 8  # they mostly wait for the store
+_MAX_PER_TENANT = 6  # threads of one tenant: two of eight are left for the others
 
 
 @dataclass(slots=True, eq=False)
@@ -44,7 +44,7 @@ _current = _OfThread()
 
 
 def check_wanted() -> None:
-    """Raise Disconnected if this thread works on a request whose robot has gone."""
+    """Raise Disconnected if this thread works on a request whose robot has disconnected."""
     task = _current.task
     if task is not None and not task.is_wanted:
         raise Disconnected("the robot closed the connection before the reply")
@@ -58,10 +58,7 @@ def while_wanted(items: Iterable[_T]) -> Iterator[_T]:
 
 
 class FairThreads:
-    """A pool of threads, which start when they are needed; `close` ends it.
-
-    An executor of the standard library takes three times as long to hand work to a thread and back.
-    """
+    """A pool of threads, which start when they are needed; `close` ends it."""
 
     def __init__(self, threads: int = _THREADS) -> None:
         self._most = threads
@@ -74,7 +71,7 @@ class FairThreads:
         )
 
     async def run(self, robot: RobotId, function: Callable[..., _T], *arguments: Any) -> _T:
-        """Return ``function(*arguments)``, computed in a thread when it is the robot's turn."""
+        """Return ``function(*arguments)``, computed in a thread when the robot is next."""
         loop = asyncio.get_running_loop()
         task = _Task(robot, function, arguments, loop, loop.create_future())
         with self._lock:

@@ -64,16 +64,14 @@ _T = TypeVar("_T")
 # Gets a request, the claims of its token, and the parameters of its path.
 Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
 
-_PIECE_BYTES, _CACHED_PIECE_BYTES = 1 << 20, 1 << 19
-"""Bytes of an object that are read at once by a thread, and by the event loop from memory."""
-_MAX_JSON_BYTES = 16384
-_MAX_NOTE_LETTERS = 500
-_MAX_PAGE = 1000
-PRESIGNED_URL_TTL_S = 300
-"""Validity of a presigned URL of the bucket: long enough to begin one transfer, too short to be passed on."""
+_PIECE_BYTES = 1 << 20  # of an object, read at once by a thread
+_CACHED_PIECE_BYTES = 1 << 19  # of an object, copied at once by the event loop from memory
+_MAX_JSON_BYTES = 16384  # of a request body in JSON; the longest has a note of 500 letters
+_MAX_NOTE_LETTERS = 500  # of the note of a version
+_MAX_PAGE = 1000  # objects in one page of a list, as many as S3 lists at once
+PRESIGNED_URL_TTL_S = 300  # validity of a presigned URL: long enough to begin one transfer
 _BEGINNING = re.compile(r"[0-9a-f]{0,64}")
-_MAP_THREADS = 1
-"""They wait for the process that reads maps, so that slow maps delay only other maps."""
+_MAP_THREADS = 1  # it waits for the process that reads maps, so that slow maps delay only other maps
 _PROBE = "ready/probe"
 _LENS = frozenset(PhotoLens.__struct_fields__)
 _COUNT = re.compile(r"[0-9]{1,6}")
@@ -81,10 +79,12 @@ _COUNT = re.compile(r"[0-9]{1,6}")
 
 @dataclass(frozen=True, slots=True)
 class MapWork:
-    """What reads maps.
+    """The functions that read maps.
 
-    *describe* returns what the map in an object that a robot sent holds; *charge* counts the CPU seconds of a
-    robot's photo.
+    Attributes:
+        describe: Returns the summary of the map in an object, given its robot and its name.
+        localiser: Localises photos in maps.
+        charge: Counts CPU seconds of a robot's photo.
     """
 
     describe: Callable[[RobotId, str], MapSummary]

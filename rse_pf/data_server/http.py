@@ -60,13 +60,13 @@ __all__ = [
 _T = TypeVar("_T")
 Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
-_MIN_BODY_BYTES_PER_S = 1024  # a slower body is refused, also if nobody else waits for its place
-_BODY_GRACE_S = 5.0  # in which a body may be slower: a robot in motion loses its network for as long
-_LEAST_TIME_S = 0.1  # for the rate of a body that has just begun
+_MIN_BODY_BYTES_PER_S = 1024  # a slower body is refused, even if no other body waits for its place
+_BODY_GRACE_S = 5.0  # a body may be slower for this time: a robot in motion may lose its network for as long
+_LEAST_TIME_S = 0.1  # shortest time over which the rate of a body is computed
 _IN_PARTS = "send the object in parts: PUT an upload"
-_DRAIN_S = 0.1  # before a refusal is sent: what is on its way is read, so that the connection goes on
-_DISCARD_S = 2.0  # after a refusal was sent, before the connection is closed
-_MAX_DROPPED_BYTES = 32 << 20  # of a body that is too long: the photo of a phone is shorter
+_DRAIN_S = 0.1  # for reading the rest of a body before a refusal is sent, so that the connection stays open
+_DISCARD_S = 2.0  # for reading the rest of a body after a refusal was sent, before the connection is closed
+_MAX_DROPPED_BYTES = 32 << 20  # of a body that is too long and read to its end; a photo of a phone is shorter
 
 
 class MethodNotAllowed(BadRequest):
@@ -82,7 +82,7 @@ class PreconditionFailed(Conflict):
 
 
 class TooManyRequests(Busy):
-    """This robot asks more than its share; the others do not notice."""
+    """This robot sends more requests than its limit allows; other robots are not affected."""
 
 
 _STATUS: dict[type[RsePfError], int] = {
@@ -152,8 +152,8 @@ class HttpRequest:
     async def body(self, max_bytes: int, *, hint: str = _IN_PARTS) -> bytes:
         """Return the whole body; *hint* says what to do if it is too long.
 
-        Most clients read a reply when they have sent all, and lose it if the connection is reset before.  So
-        a body that is too long is read to its end, and dropped, up to `_MAX_DROPPED_BYTES`.
+        Most clients read the reply only after they have sent the whole body, and lose it if the connection
+        is reset before.  A body that is too long is therefore read to its end, up to `_MAX_DROPPED_BYTES`.
 
         Raises:
             LimitExceeded: It is longer than *max_bytes*.
@@ -162,7 +162,7 @@ class HttpRequest:
             RsePfError: The refusal of `end_body`.
         """
         announced = self.header_number("content-length") or 0
-        is_sent = "expect" not in self.headers  # before the client was told to go on
+        is_sent = "expect" not in self.headers  # else the client waits for "100 Continue" before the body
         if announced > (_MAX_DROPPED_BYTES if is_sent else max_bytes):
             raise _too_long(announced, max_bytes, hint)
         pieces = []
@@ -202,18 +202,18 @@ class HttpRequest:
         self._reader.cancel()
 
     async def drain_soon(self, max_bytes: int) -> bool:
-        """Do the same as `drain`, for `_DRAIN_S` at the most: what is on its way can still be read."""
+        """Call `drain` for at most `_DRAIN_S`, for a body whose rest is already on its way."""
         try:
             return await _within(_DRAIN_S, self.drain(max_bytes))
         except asyncio.TimeoutError:
             return False
 
     async def discard(self) -> None:
-        """Read and drop what a robot sends that has its reply: it reads the reply when it has sent.
+        """Read and drop the rest of a body after the reply was sent, at most `_MAX_DROPPED_BYTES` in
+        `_DISCARD_S`.
 
-        Closing the connection instead would reset it, and the reply would be lost.  At most
-        `_MAX_DROPPED_BYTES` are read, and for `_DISCARD_S`.  A robot that waits to be told to go on sends
-        nothing.
+        Closing the connection instead would reset it, and the reply would be lost.  A client that waits for
+        "100 Continue" sends no body.
         """
         if "expect" in self.headers and not self.received_bytes:
             return

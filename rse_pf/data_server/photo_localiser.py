@@ -29,10 +29,9 @@ if TYPE_CHECKING:
 __all__ = ["LEAST_PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
 
 TARGET = f"{__name__}:make_handler"
-LEAST_PROCESSES = 3
-"""A robot has one of them at most, and the last one waits for a tenant that has none (`FairThreads`)."""
-_CACHED_MAPS = 4
-_MAX_PHOTO_S = 3.0  # of CPU time without that for the map: 16 megapixels take 0.7 s, other photos wait for it
+LEAST_PROCESSES = 3  # a robot has at most one, and the last is left to a tenant that has none (`FairThreads`)
+_CACHED_MAPS = 4  # maps that a process keeps in memory
+_MAX_PHOTO_S = 3.0  # CPU time of a photo, without that of reading the map: 16 megapixels take 0.7 s
 
 
 class _Request(msgspec.Struct, frozen=True, kw_only=True):

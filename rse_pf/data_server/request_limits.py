@@ -1,8 +1,13 @@
-"""Decide whether a robot's request is taken now: its rate, its requests in progress, and bodies in memory.
+"""Decide whether a request of a robot is accepted: by its rate, its requests in progress, and bodies in
+memory.
 
-What one robot sends never uses up what others need.  Every limit is kept for each robot.  The places for
-bodies, which all robots share, are limited for each robot and each tenant, too; when none is free, the
-slowest body of the tenant, then robot, that holds most places gives up its place.  Time is an argument.
+1. Rate: each robot has a token bucket, and a request takes as many tokens as its route costs.
+2. Requests in progress: at most `MAX_REQUESTS_PER_ROBOT` of a robot.
+3. Bodies in memory: at most ``data.max_uploads`` of all robots, and a share of them for one robot and one
+   tenant. When all places are taken, the slowest body of the robot that holds most places, of the tenant that
+   holds most, is refused in favour of the new one.
+
+Time is an argument.
 """
 
 from __future__ import annotations
@@ -18,19 +23,16 @@ from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = ["RequestLimits"]
 
-_BURST_S = 4.0
-"""A robot may make the requests of this time at once."""
-_MAX_ROBOTS = 10_000
-MAX_REQUESTS_PER_ROBOT = 8
-"""Requests of one robot in progress; more are refused."""
+_BURST_S = 4.0  # size of a robot's token bucket: the requests of this time may come at once
+_MAX_ROBOTS = 10_000  # robots whose buckets are remembered
+MAX_REQUESTS_PER_ROBOT = 8  # requests of one robot in progress; more are refused
 _BODIES_PER_ROBOT = 0.25  # of ``data.max_uploads``
 _BODIES_PER_TENANT = 0.75  # of ``data.max_uploads``
-_RETRY_AFTER_MS = 1000.0  # for who got no place, or lost it: most bodies come within this time
-_REFUSED_BYTES = 64 << 10  # of a refused body count as one request more: they are read and dropped
-_REFUSED_COST = 32.0  # requests that one refused body counts for at the most: 2 MiB
+_RETRY_AFTER_MS = 1000.0  # after a refusal for lack of a place: most bodies are received within this time
+_REFUSED_BYTES = 64 << 10  # bytes of a refused body that take one token, because they are read and dropped
+_REFUSED_COST = 32.0  # most tokens that one refused body takes: those of 2 MiB
 
-CPU_S_PER_REQUEST = 0.005
-"""A request whose work took more CPU time than its cost in requests counts by its CPU time."""
+CPU_S_PER_REQUEST = 0.005  # CPU seconds that one token pays for; more work takes further tokens afterwards
 
 
 @dataclass(slots=True)
@@ -55,12 +57,12 @@ class RequestLimits:
         return len(self._robots)
 
     def begin(self, request: HttpRequest, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
-        """Take a request of *robot*, until `end`; one whose body gets no place counts for its rate, too.
+        """Accept a request of *robot* until `end`; a request whose body gets no place takes its tokens, too.
 
         Args:
-            request: What it sends.
-            robot: Who sends it.
-            cost: How many plain requests it counts for.
+            request: The request.
+            robot: The robot that sends it.
+            cost: Number of tokens that it takes.
             now: Monotonic seconds.
             has_body: Whether its body will be held in memory.
 
@@ -91,33 +93,34 @@ class RequestLimits:
         self._in_progress[request] = robot
 
     def end(self, request: HttpRequest) -> None:
-        """Give back what `begin` took, except for the rate."""
+        """Free the places of a request; its tokens stay taken."""
         robot = self._in_progress.pop(request, None)
         if robot is not None:
             self._robots[robot].requests -= 1
             self._bodies.pop(request, None)
 
     def charge_refused(self, robot: RobotId, body_bytes: int, now: float) -> None:
-        """Count the body of a request that began and was refused: reading it takes time from others.
+        """Take tokens for the body of an accepted request that was refused later, since it was read for
+        nothing.
 
-        Bodies that `begin` refuses are not counted: their connections pause, and their robots may come back.
+        Bodies that `begin` refuses take none: their connections pause.
 
         Args:
-            robot: Who sent it.
-            body_bytes: How long the body is, or says that it is.
+            robot: The robot that sent it.
+            body_bytes: Length of the body, received or announced.
             now: Monotonic seconds.
         """
         self._state_of(robot, now).bucket.spend(min(body_bytes / _REFUSED_BYTES, _REFUSED_COST), now)
 
     def charge_cpu(self, robot: RobotId, cpu_s: float, paid: float, now: float) -> None:
-        """Count the CPU time of a request's work, beyond what it counted for when it began.
+        """Take further tokens for the CPU time of a request, beyond those that it took when it began.
 
-        One request counts for no more than what may come at once: the first one of a map reads that map.
+        One request takes at most a whole bucket, because the first request for a map has to read that map.
 
         Args:
-            robot: Who sent it.
-            cpu_s: CPU seconds.
-            paid: The cost with which it began.
+            robot: The robot that sent it.
+            cpu_s: CPU seconds of the request.
+            paid: Tokens that it took when it began.
             now: Monotonic seconds.
         """
         bucket = self._state_of(robot, now).bucket
@@ -136,7 +139,7 @@ class RequestLimits:
         reached = next((limit for limit in limits if limit[0] >= limit[1]), None)
         if reached is None:
             return
-        # What is complete keeps its place: it is being worked on, and no client holds it up.
+        # A complete body keeps its place: it is being processed, and waits for no client.
         receiving = [
             (request, holder)
             for request, holder in self._bodies.items()
@@ -151,7 +154,8 @@ class RequestLimits:
         is_other_tenant = holder.tenant != robot.tenant
         held = of_tenant[holder.tenant] if is_other_tenant else of_robot[holder]
         own = of_tenant[robot.tenant] if is_other_tenant else of_robot[robot]
-        # With one place fewer, the holder must still have as many as this robot, or they would take turns.
+        # With one place fewer the holder must still have as many as this robot; otherwise both would lose
+        # their places in alternation.
         if slowest is None or held < own + 2 or reached is limits[0]:
             count, limit, whose = reached
             raise Busy(
@@ -179,7 +183,7 @@ class RequestLimits:
         return state
 
     def _forget_one(self, now: float) -> None:
-        """Forget the robot that has been quiet for longest; its bucket is full again in all likelihood."""
+        """Forget the robot without requests for longest whose bucket is full, if there are too many."""
         if len(self._robots) > _MAX_ROBOTS:
             for robot, state in self._robots.items():
                 if not state.requests and state.bucket.is_full(now):

@@ -1,6 +1,6 @@
-"""Processes with limits that work on what robots sent.
+"""Processes with limits on memory and CPU time, which decode the data of robots.
 
-A robot whose bytes ended two of them is refused for a while.
+A robot whose data ended two of them is refused for a while (`CrashRecord`).
 """
 
 from __future__ import annotations
@@ -20,10 +20,8 @@ __all__ = ["RobotProcesses", "max_map_bytes", "shared_store"]
 
 _PRIVATE_STORE = "memory:"
 """The ``data.store`` that other processes cannot read."""
-_MAX_INFLATED = 4
-"""Times ``data.max_object_bytes``."""
-_WALL_S_PER_CPU_S = 3.0
-"""The processes have a low priority: on a busy machine poses go first."""
+_MAX_INFLATED = 4  # an inflated map may have this many times ``data.max_object_bytes``
+_WALL_S_PER_CPU_S = 3.0  # of the timeout: the processes have a low priority, and wait on a busy machine
 
 
 def max_map_bytes(settings: PlatformSettings) -> int:
@@ -49,15 +47,15 @@ class RobotProcesses:
         count: int = 1,
         processes: LimitedProcesses | None = None,
     ) -> None:
-        """Remember what is needed; nothing is started.
+        """Start nothing yet.
 
         Args:
             target: ``module:function``, which takes the settings in JSON and returns the handler.
             settings: Groups data, serving and services.
-            store: Of the data server; the processes read it themselves unless it is in its memory.
+            store: Store of the data server; processes read it themselves unless it is in its memory.
             clock: Monotonic seconds.
-            count: Calls that are worked on at the same time.
-            processes: What answers; None means processes with the limits of ``serving``.
+            count: Calls that run at the same time.
+            processes: The processes; None makes some with the limits of ``serving``.
         """
         self.count = count
         self.private_store = store if settings.data.store == _PRIVATE_STORE else None
@@ -76,7 +74,7 @@ class RobotProcesses:
     def call(
         self, robot: RobotId, request: bytes, *, near: str = "", charge: Callable[[float], None] | None = None
     ) -> bytes:
-        """Return the handler's reply to what *robot* asked; blocks.
+        """Return the reply of the handler to *request* of *robot*; blocks.
 
         *near* and *charge* are those of `LimitedProcesses.call`.
 

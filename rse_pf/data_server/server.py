@@ -34,16 +34,16 @@ from rse_pf.terminal import json_line, show
 
 __all__ = ["KeysFile", "serve_data"]
 
-_SWEEP_S = 3600.0
-_STOP_TIMEOUT_S = 10
-_MAX_IDLE = 2048
-"""Connections that wait for their next request."""
+_SWEEP_S = 3600.0  # between two deletions of old uploads
+_STOP_TIMEOUT_S = 10  # seconds to complete requests after a signal
+_MAX_IDLE = 2048  # connections that wait for their next request
+# Longest time that a thread keeps the interpreter lock: a PUT makes some twenty system calls, and may wait
+# for the lock after each.
 _SWITCH_S = 0.0005
-"""A PUT makes some twenty system calls, and after each it may wait this long for a thread that computes."""
 
 
 class KeysFile:
-    """The public keys in a file, with roster and deny list beside it, reread periodically by `TrustStore`."""
+    """Public keys in a file, with roster and deny list in the same folder, read again periodically."""
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._trust = TrustStore(path)
@@ -69,8 +69,8 @@ def serve_data(
     """Serve until a signal ends the process; return the exit code.
 
     Args:
-        settings: Groups data, auth; ``data.port`` 0 takes a free one.
-        store: Where objects and maps live.
+        settings: Settings of the platform; with ``data.port`` 0 a free port is chosen.
+        store: Store of objects and maps.
         keys: Returns the keys that may sign tokens, for each request.
         announce: File that gets pid and port as JSON when requests are answered.
         audit: Folder of the audit log; None records nothing.

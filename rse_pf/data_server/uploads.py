@@ -27,12 +27,11 @@ from rse_pf.storage.quotas import Accounts
 __all__ = ["Objects"]
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_MAX_OPEN_UPLOADS = 1000  # of one robot
-UPLOAD_TTL_S = 86_400.0
-"""An unfinished upload is deleted after this: a robot that is off the network for a day begins again."""
-_FEW_PARTS, _SHORT_PART_BYTES = 64, 65_536
-"""An upload has at most so many parts, and one more for each so many bytes of the object."""
-_PIECE_BYTES = 1 << 20
+_MAX_OPEN_UPLOADS = 1000  # incomplete uploads of one robot
+UPLOAD_TTL_S = 86_400.0  # an unfinished upload is deleted after a day: its robot begins again
+_MIN_PARTS = 64  # parts that an upload of any size may have
+_SHORT_PART_BYTES = 65_536  # an upload may have one further part for this many bytes of the object
+_PIECE_BYTES = 1 << 20  # read at once when a part is hashed
 
 
 class Objects:
@@ -178,7 +177,7 @@ class Objects:
                 raise BadRequest(
                     f"{len(data)} bytes at {offset} do not fit {size}", hint="check size, offset and length"
                 )
-            if len(parts) >= _FEW_PARTS + size // _SHORT_PART_BYTES:
+            if len(parts) >= _MIN_PARTS + size // _SHORT_PART_BYTES:
                 raise LimitExceeded(
                     f"the upload has {len(parts)} parts already",
                     hint=f"DELETE it, begin again and send parts of {self._settings.part_bytes} bytes",

@@ -1,6 +1,7 @@
-"""The record of a job, and who may run it: what a lease (`rse_pf.storage.lease`) means for jobs.
+"""Store the record of a job, and decide by its lease (`rse_pf.storage.lease`) which worker may run it.
 
-Nobody looks for jobs without an owner: one that lost its owner begins anew where its robot asks again.
+No server looks for jobs without an owner.  A job whose owner has failed starts again when its robot sends the
+same request again.
 """
 
 from __future__ import annotations
@@ -29,11 +30,9 @@ __all__ = [
     "verdict_on",
 ]  # fmt: skip
 
-_RENEWALS_PER_LEASE = 5
-_MAX_RENEWAL_S = 1.0
-"""Who follows a job of another server sees its progress no later than this."""
-MAX_TRIES = 3
-"""A job whose owners stopped renewing their lease this often is not run again: it may have crashed them."""
+_RENEWALS_PER_LEASE = 5  # a lease outlives several failed renewals
+_MAX_RENEWAL_S = 1.0  # longest time between renewals, and so until another server shows new progress
+MAX_TRIES = 3  # a job whose owners failed this often is not run again: it may have crashed them
 
 State = Literal["running", "given-up", "done", "failed", "swept"]
 Verdict = Literal["take", "follow", "done", "failed", "poison"]
@@ -49,7 +48,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     share: float = 0.0
     what: str = ""
     cancel: bool = False
-    """A follower asks the owner to end it."""
+    """Set by a follower to request that the owner cancels the job."""
     reply: str = ""
     reply_bytes: int = 0
     compute_ms: float = 0.0

@@ -1,8 +1,8 @@
-"""The long jobs of one worker: which commands wait for which job, their progress and their answers.
+"""The long jobs of one worker: the commands that wait for each job, its progress, and the answers.
 
-A job is named by its robot and the digest of its request, so the same request twice waits for one job.  It
-outlives the connection that asked for it.  Nothing here blocks the event loop, and a robot is sent progress
-at most twice a second.
+A job is identified by its robot and the digest of its request, so that two equal requests wait for one job.
+It outlives the connection of its robot.  Nothing here blocks the event loop, and progress is sent at most
+twice a second.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from rse_pf.wire.arrays import extension_hook
 
 __all__ = ["JobManager"]
 
-_PROGRESS_INTERVAL_S = 0.5
-_BUSY_RETRY_MS = 5000.0
-_CLOSE_TIMEOUT_S = 1.0
+_PROGRESS_INTERVAL_S = 0.5  # shortest time between two progress messages for one command
+_BUSY_RETRY_MS = 5000.0  # pause of a robot whose job is refused: jobs take seconds to minutes
+_CLOSE_TIMEOUT_S = 1.0  # for the records of jobs that are given up when the worker exits
 
 
 @dataclass(eq=False, slots=True)
@@ -61,7 +61,7 @@ class _Entry:
 
 
 class JobManager(CommandQueue):
-    """The jobs that robots of one worker wait for, on whichever server they run."""
+    """The jobs for which robots of one worker wait, on whichever server they run."""
 
     def __init__(
         self,
@@ -82,8 +82,8 @@ class JobManager(CommandQueue):
             log: Log of the worker.
             answer: Called exactly once for each submitted command whose robot stays connected, unless the
                 server drains before the job's end.
-            progress: Called with the connection of a command, and its progress.
-            owner: Name of this worker that is unique among all workers of all servers.
+            progress: Called with the connection of a command, and the progress of its job.
+            owner: Name of this worker, unique among the workers of all servers.
         """
         self._context = context
         self._serving = context.settings.serving
@@ -104,7 +104,7 @@ class JobManager(CommandQueue):
         self._settings_digest = _settings_digest(context.settings)
 
     held = 0
-    """Commands for which a server that drains waits: none, because other servers run these jobs anew."""
+    """Commands for which a draining server waits: none, because other servers start these jobs again."""
 
     def offers(self, service: str) -> bool:
         """Return whether *service* is a long one."""
@@ -164,14 +164,14 @@ class JobManager(CommandQueue):
                     return
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
-        """Forget the commands of a connection that ended; their jobs go on until the robot reconnects."""
+        """Forget the commands of a connection that ended; their jobs continue until the robot reconnects."""
         for entry in self._entries.values():
             entry.waiters = [waiter for waiter in entry.waiters if waiter.queued.owner is not owner]
             entry.resubmitted = [queued for queued in entry.resubmitted if queued.owner is not owner]
         return []
 
     def give_up(self) -> None:
-        """Leave all jobs to other servers, and accept no more."""
+        """Leave all jobs to other servers, and accept no further commands."""
         self._leaving = True
         for entry in self._entries.values():
             entry.signals.give_up()
@@ -185,7 +185,11 @@ class JobManager(CommandQueue):
                 entry.thread.join(max(0.0, until - self._context.clock()))
 
     def _has_capacity(self, request: JobRequest) -> bool:
-        """Return whether one more job may wait; the newest job of a robot with many may be refused for it."""
+        """Return whether one more job may wait.
+
+        If all places are taken, the newest waiting job of a robot that has more is refused instead
+        (`largest_holder`).
+        """
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
         if len(here) < self._serving.max_running_jobs + self._serving.max_waiting_jobs:
             return True
@@ -205,11 +209,11 @@ class JobManager(CommandQueue):
         def work() -> None:
             in_loop = self._loop.call_soon_threadsafe
 
-            def tell(done: float, what: str) -> None:
+            def report(done: float, what: str) -> None:
                 in_loop(self._on_progress, entry, done, what)
 
             try:
-                outcome = run_job(entry.request, self._context, entry.signals, tell, self._owner)
+                outcome = run_job(entry.request, self._context, entry.signals, report, self._owner)
             except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
                 self._log.error("job-defect", service=entry.request.service, reason=repr(error))
                 outcome = JobOutcome(error=RsePfError("the job failed", hint="the server's log has it"))
@@ -221,9 +225,9 @@ class JobManager(CommandQueue):
         entry.thread.start()
 
     def report(self) -> QueueReport:
-        """Return how many jobs are known here, on whichever server they run, and how many run nowhere yet.
+        """Return how many jobs robots of this worker wait for, and how many of these run nowhere yet.
 
-        The processor time is that of the jobs that ran here and have ended.
+        The CPU seconds are those of the jobs that have run on this worker and ended.
         """
         pending = sum(entry.what == WAITING for entry in self._entries.values())
         return QueueReport(

@@ -1,4 +1,4 @@
-"""The process of one job: the worker starts it with `spawner`, it runs one command and ends.
+"""The process of one job: the worker starts it with `spawner`, it runs one command and exits.
 
 Over one socket it receives an order, sends progress and then one answer.  It runs at a lower priority than
 the workers, within its memory limit, and does not outlive its worker.  It reads its inputs and stores its
@@ -42,17 +42,17 @@ from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = ["JobRequest", "inline_bytes", "retry_store", "run", "spawner", "store_reply"]
 
+# Niceness of a job.  On a busy core the scheduler of Linux gives it a tenth of the time, so that it ends, and
+# nine tenths to the commands of robots.
 _NICE = 10
-"""A job gets a tenth of a core that others want, and so ends on a machine that is always busy; commands of
-robots, which have a weight nine times as large, do not wait for it."""
-_REPORT_INTERVAL_S = 0.5
-_STORE_TRIES = 3
+_REPORT_INTERVAL_S = 0.5  # shortest time between two progress messages to the worker
+_STORE_TRIES = 3  # of an operation of the store, before the job fails
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRequest:
-    """A job that a robot asked for.
+    """A job that a robot requested.
 
     ``quota_bytes`` limits all that the robot stores, results included; None for ``data.quota_bytes``.
     """
@@ -63,7 +63,7 @@ class JobRequest:
     key: str
     quota_bytes: float | None
     trace: str = ""
-    """Of the command that asked for it first."""
+    """Trace id of the command that started the job."""
 
 
 def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], Child]:

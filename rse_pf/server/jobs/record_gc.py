@@ -20,12 +20,12 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["RECORD_TTL_S", "RecordCollector"]
 
-RECORD_TTL_S = 604_800.0
-"""A record that was not written for a week is deleted; the same request then runs again."""
+RECORD_TTL_S = 604_800.0  # a record that was not written for a week is deleted; its request then runs again
 _PREFIX = "jobs/"
-_LIST_INTERVAL_S = 3600.0
-_BATCH = 64
-"""Records read in one call: it blocks the thread of a job."""
+_LIST_INTERVAL_S = (
+    3600.0  # between two listings of all records: each costs one request to the store for 1,000 records
+)
+_BATCH = 64  # records read in one call, which blocks the thread of a job
 
 
 class RecordCollector:

@@ -1,7 +1,11 @@
-"""One job, from the first read of its record to its outcome: follow it, run it, or return its result.
+"""Run or follow one job in a thread of the worker, and return its outcome.
 
-Runs in a thread of the worker, because it only waits: for the store, for a slot, for the job's process.  A
-process that it started has ended when it returns.
+1. Read the record of the job.  If it is done, return its result.
+2. If another worker runs it, follow its progress until it ends, or until its lease expires.
+3. Otherwise wait for a slot, claim the lease, run the job in a process, and renew the lease meanwhile.
+
+The thread only waits: for the store, for a slot, and for the process.  The process has ended when `run_job`
+returns.
 """
 
 from __future__ import annotations
@@ -36,22 +40,21 @@ from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name
 from rse_pf.server.jobs.process import JobRequest, inline_bytes, retry_store
 from rse_pf.server.jobs.slots import JobSlots
 from rse_pf.server.robot_store import store_within_quota
+from rse_pf.service import Report
 from rse_pf.storage.object_store import ObjectStore, digest_of
 from rse_pf.storage.quotas import Accounts
 
 __all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
 
-_POLL_SHARE = 0.5
-"""Share of the time between two renewals after which a follower reads the record again."""
-_KILL_AFTER_S = 0.6
-"""A cancelled job that does not end is killed after this."""
+_POLL_SHARE = 0.5  # of the time between two renewals: a follower reads the record this often
+_KILL_AFTER_S = 0.6  # a cancelled job has this long to exit before it is killed
 _READ_BYTES = 1 << 18
 WAITING, STARTING = "waits for its turn", "starts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobContext:
-    """What all jobs of one worker share."""
+    """The values that all jobs of one worker share."""
 
     store: ObjectStore
     slots: JobSlots
@@ -60,12 +63,12 @@ class JobContext:
     start: Callable[[JobRequest], Child]
     clock: Callable[[], float]
     services: frozenset[str] = frozenset()
-    """Names of the long services, of which robots may ask."""
+    """Names of the long services, which run as jobs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """How a job ended: a reply under its digest, an error, or neither: it was given up."""
+    """The end of a job: a reply with its digest, an error, or neither if the job was given up."""
 
     object: str = ""
     reply: bytes | None = None
@@ -73,7 +76,7 @@ class JobOutcome:
     compute_ms: float = 0.0
     error: RsePfError | None = None
     cpu_s: float = 0.0
-    """Processor time of its process, if it ran here."""
+    """CPU seconds of its process, if it ran on this server."""
 
     @property
     def is_given_up(self) -> bool:
@@ -82,7 +85,7 @@ class JobOutcome:
 
 
 class JobSignals:
-    """What the worker signals to the thread of a job; signals are never cleared."""
+    """Signals of the worker to the thread of a job; they are never cleared."""
 
     def __init__(self) -> None:
         self.cancelled = False
@@ -91,12 +94,12 @@ class JobSignals:
         self._lock = threading.Lock()
 
     def cancel(self) -> None:
-        """The robot cancelled the job."""
+        """Signal that the robot cancelled the job."""
         self.cancelled = True
         self._wake()
 
     def give_up(self) -> None:
-        """The server drains."""
+        """Signal that another server should take the job."""
         self.giving_up = True
         self._wake()
 
@@ -122,31 +125,28 @@ class JobSignals:
                 os.eventfd_write(self._fd, 1)
 
 
-Tell = Callable[[float, str], None]
-
-
 def run_job(
-    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, owner: str
+    request: JobRequest, context: JobContext, signals: JobSignals, report: Report, owner: str
 ) -> JobOutcome:
     """Run or follow the job and return its outcome; blocks until then.
 
     Args:
         request: The job.
-        context: Of the worker.
-        signals: Set by the event loop of the worker.
-        tell: Called in this thread with the share that is done, and what is being done.
-        owner: Name that is unique to this process, which runs a job once at a time.
+        context: The values that all jobs of the worker share.
+        signals: Signals of the worker's event loop.
+        report: Called in this thread with the share that is done (0..1), and with what is being done.
+        owner: Name that is unique to this process, which runs each job at most once at a time.
     """
     name = record_name(request.robot, request.key)
     lease = JobLease(context.store, name, owner, context.clock)
     try:
-        return _follow_or_run(request, context, signals, tell, lease)
+        return _follow_or_run(request, context, signals, report, lease)
     except RsePfError as error:
         return JobOutcome(error=error)
 
 
 def _follow_or_run(
-    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
+    request: JobRequest, context: JobContext, signals: JobSignals, report: Report, lease: JobLease
 ) -> JobOutcome:
     serving = context.settings.serving
     while True:
@@ -161,7 +161,7 @@ def _follow_or_run(
             is_watched=lease.is_watched, is_ours=lease.is_ours,
         )  # fmt: skip
         if verdict == "follow" and record is not None:
-            tell(record.share, record.what)
+            report(record.share, record.what)
             signals.wait(renewal_s(serving.job_lease_s) * _POLL_SHARE)
             continue
         if verdict == "failed" and record is not None:
@@ -175,12 +175,12 @@ def _follow_or_run(
             stored = _stored_outcome(request, context, record)
             if stored is not None:
                 return stored
-        tell(0.0, WAITING)
+        report(0.0, WAITING)
         if not context.slots.acquire(request.robot, signals.wait):
             continue
         try:
             if lease.take():
-                outcome = _JobRun(request, context, signals, tell, lease).work()
+                outcome = _JobRun(request, context, signals, report, lease).work()
                 if outcome is not None:
                     return outcome
         finally:
@@ -205,12 +205,12 @@ class _JobRun:
     """The run of a job whose lease this worker holds."""
 
     def __init__(
-        self, request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
+        self, request: JobRequest, context: JobContext, signals: JobSignals, report: Report, lease: JobLease
     ) -> None:
         self._request = request
         self._context = context
         self._signals = signals
-        self._tell = tell
+        self._report = report
         self._lease = lease
         self._done, self._what = 0.0, STARTING
         self._frames = FrameReader(context.settings.data.max_object_bytes)
@@ -219,7 +219,7 @@ class _JobRun:
 
     def work(self) -> JobOutcome | None:
         """Return the outcome; None if another server took the job."""
-        self._tell(0.0, STARTING)
+        self._report(0.0, STARTING)
         process = self._context.start(self._request)
         try:
             why = self._supervise(process)
@@ -299,7 +299,7 @@ class _JobRun:
             for message in self._frames.feed(data):
                 if message[0] == "progress":
                     self._done, self._what = float(message[1]), str(message[2])
-                    self._tell(self._done, self._what)
+                    self._report(self._done, self._what)
                 else:
                     self._end, self._is_over = message, True
         except LimitExceeded as error:

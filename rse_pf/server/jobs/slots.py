@@ -16,7 +16,7 @@ from rse_pf.limits.fair_queue import FairQueue
 
 __all__ = ["JobSlots", "make_slot_file"]
 
-_POLL_S = 0.1
+_POLL_S = 0.1  # between two tries to get a slot, since the kernel reports no released lock
 
 
 def make_slot_file() -> int:
@@ -25,7 +25,7 @@ def make_slot_file() -> int:
 
 
 class JobSlots:
-    """The slots as one worker sees them; used by its threads, and once in each process."""
+    """The slots for the threads of one worker; at most one object in a process."""
 
     def __init__(self, file: int, count: int) -> None:
         """Take no slot yet.
@@ -36,7 +36,7 @@ class JobSlots:
         """
         self._file, self._count = file, count
         self._taken: set[int] = set()
-        """Slots of this worker: the kernel would grant their locks to the same process again."""
+        """Slots of this worker, because the kernel grants a lock to the same process again."""
         self._queue: FairQueue[object] = FairQueue()
         self._lock = threading.Lock()
 

@@ -23,8 +23,8 @@ _PREFIX = "rse-pf-sandbox-"
 _SERVER_GROUP = "rse-pf-server"
 """Cgroup (v2) of the server's own processes: one that holds processes cannot hold cgroups with limits."""
 _DELEGATE_ATTRIBUTES = ("user.delegate", "trusted.delegate")
-_SERVER_WEIGHT, _SANDBOX_WEIGHT = 400, 100
-"""CPU of the server against that of one busy sandbox, however many threads it runs.  Version 1: one share."""
+_SERVER_WEIGHT = 400  # CPU weight of the server: on a busy core it gets four times the time of one sandbox
+_SANDBOX_WEIGHT = 100  # CPU weight of one sandbox, however many threads it has
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The process of one sandbox: isolate itself, then answer the worker's requests until the end.
+"""The process of one sandbox: isolate itself, then answer the requests of the worker until it is ended.
 
 One process, one thread, one socket to its worker.  No code of a service runs before the isolation is
 complete, and whatever a service raises becomes a typed failure.
@@ -31,29 +31,33 @@ from rse_pf.services.custom.runtime import Runtime, open_runtime
 
 __all__ = ["SandboxPlan", "readable_paths", "run_sandbox"]
 
-_UNBUFFERED = 2
-"""``_IONBF`` of the GNU C library and of musl."""
-_MAX_PROBLEM = 150
+_UNBUFFERED = 2  # ``_IONBF`` of the GNU C library and of musl
+_MAX_PROBLEM = 150  # characters of the reason why a reply cannot be encoded
 _REPLY_HINT = "reply with numbers, text, bytes, lists, maps and arrays of numbers"
-_FRAMES_SHOWN = -3
-"""The last ones: those of the service."""
+_FRAMES_SHOWN = -3  # the last frames of a traceback, which are those of the service
 _LOADER_CACHE = Path("/etc/ld.so.cache")
 _SYSTEM_PATHS = (
     str(_LOADER_CACHE), "/etc/localtime", "/usr/lib/locale", "/usr/share/zoneinfo",
 )  # fmt: skip
 _LINKS = (Path("/lib"), Path("/lib64"))
-"""Where /usr is merged they are links, which the loader and libraries name."""
+"""Links of a system with a merged /usr, by which the loader and libraries name files."""
 _SHARED_PREFIXES = ("/usr", "/usr/local")
-"""Of a Python whose ``lib`` folder is not its own."""
+"""Prefixes of a Python that shares its ``lib`` folder with the system."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SandboxPlan:
-    """What every sandbox of a server has in common.
+    """The values that all sandboxes of a server share.
 
-    ``readable`` is what `readable_paths` returned, ``max_bytes`` limits a reply, and ``missing`` names the
-    means of isolation that this kernel lacks.  ``copies`` are the folders in whose places a sandbox sees a
-    `VerifiedCopy`, and ``refused`` says by name why a service is not loaded.
+    Attributes:
+        services: The installed services by name.
+        readable: The paths of `readable_paths`.
+        memory_bytes: Memory of one sandbox.
+        scratch_bytes: Size of its scratch folder.
+        max_bytes: Largest reply.
+        missing: The means of isolation that this kernel lacks.
+        copies: The `VerifiedCopy` that a sandbox sees in place of each folder.
+        refused: The error of each service that is not loaded, by name.
     """
 
     services: Mapping[str, InstalledService]

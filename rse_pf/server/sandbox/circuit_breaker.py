@@ -1,17 +1,23 @@
-"""Decide which requests and services are not run again after crashes, and for whom.
+"""Decide which services and requests are refused after crashes of their sandboxes, and to which robots.
 
-Evidence is kept for each robot first.  A service whose sandboxes of one robot ended ``breaker_crashes`` times
-within `WINDOW_S` is refused to that robot for `OPEN_S`: its circuit breaker is open.  A request
-that crashed `POISON_CRASHES` sandboxes of one robot is poison for it until `POISON_S` have passed.
-Both hold for others only when their sandboxes crashed as well:
+- Circuit breaker: a service whose sandboxes of one robot ended ``breaker_crashes`` times within `WINDOW_S` is
+  refused to that robot for `OPEN_S`.
+- Poison request: a request that crashed `POISON_CRASHES` sandboxes of one robot is refused to it for
+  `POISON_S`.
 
-- for a tenant, when the crashes are those of at least `ROBOTS_OF_A_TENANT` robots of it;
-- for all, when they are those of at least as many robots, and at least `ROBOTS_OF_OTHERS` of these do not
-  belong to the tenant that has the most of them.  No tenant can take a service from another one.
+Both apply to other robots only if their sandboxes crashed as well:
 
-A sandbox that was killed because its robot's deadline had passed did not crash.  Such overruns count for
-that robot alone, and never make a request poison.  Time is an argument, it never goes back, and memory is
-bounded whatever robots send.
+- to all robots of a tenant if sandboxes of at least `ROBOTS_OF_A_TENANT` of its robots crashed;
+- to all robots if sandboxes of at least as many robots crashed, and at least `ROBOTS_OF_OTHERS` of these
+  robots do not belong to the tenant that has the most of them.  No tenant can make a service unavailable to
+  another.
+
+A sandbox that was killed because the deadline of its robot had passed did not crash.  Such overruns count for
+that robot alone, and never make a request poison.  Time is an argument, and memory is bounded whatever robots
+send.
+
+Source:
+    Nygard 2007, "Release It!" (circuit breaker).
 """
 
 from __future__ import annotations
@@ -37,26 +43,21 @@ __all__ = [
     "CircuitBreaker",
 ]
 
-WINDOW_S = 30.0
-"""``services.breaker_crashes`` within this open the circuit breaker."""
-OPEN_S = 60.0
-"""Time that the circuit breaker of a service stays open."""
-POISON_CRASHES = 2
-"""A request that crashed this many sandboxes is poison: dead-letter queues count so, too."""
-POISON_S = 600.0
-"""A request is tried again this long after the crashes that made it poison."""
-ROBOTS_OF_A_TENANT = 3
-ROBOTS_OF_OTHERS = 2
-_MAX_REQUESTS = 10_000
-_MAX_ENDS_OF_REQUEST = 32
-_MAX_ENDS_OF_SERVICE = 1024
-_MAX_BREAKERS = 10_000
-_MAX_REQUESTS_LISTED = 1000
-"""So that an operator's question does not hold up the worker, whatever robots have sent."""
+WINDOW_S = 30.0  # ``services.breaker_crashes`` ends within this time open the circuit breaker
+OPEN_S = 60.0  # a circuit breaker stays open for this time, then the service is tried again
+POISON_CRASHES = 2  # one crash may be that of the service; the retry of the same request is the second one
+POISON_S = 600.0  # a poison request is tried again after this time
+ROBOTS_OF_A_TENANT = 3  # robots whose sandboxes crashed, before the others of their tenant are refused
+ROBOTS_OF_OTHERS = 2  # of them from other tenants, before all robots are refused
+_MAX_REQUESTS = 10_000  # requests whose crashes are remembered; the oldest are forgotten first
+_MAX_ENDS_OF_REQUEST = 32  # crashes remembered of one request
+_MAX_ENDS_OF_SERVICE = 1024  # crashes and overruns remembered of one service
+_MAX_BREAKERS = 10_000  # circuit breakers remembered; the one that opened first is forgotten first
+_MAX_REQUESTS_LISTED = 1000  # requests in a list for an operator, so that it does not delay the worker
 
 Reason = Literal["crashes", "overruns", "poison"]
 Scope = RobotId | str | None
-"""For whom something is refused: one robot, the robots of a tenant (its name), or all (None)."""
+"""The robots to which something is refused: one robot, all of a tenant (its name), or all (None)."""
 
 
 class _End(NamedTuple):
@@ -73,15 +74,15 @@ class _Breaker(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """What is refused to whom, as an operator reads it.
+    """A refusal after crashes, for operators.
 
     Attributes:
-        service: Its name.
+        service: Name of the service.
         reason: "crashes" or "overruns" for an open circuit breaker, "poison" for requests.
-        tenant: For whom; None means all tenants.
-        robot: Its name; None means all robots of the tenant.
-        requests: Number of requests that are poison, of the latest thousand; 0 for a circuit breaker.
-        left_s: Seconds until the last of it ends.
+        tenant: Tenant to which it applies; None means all tenants.
+        robot: Name of the robot to which it applies; None means all robots of the tenant.
+        requests: Number of poison requests, of the latest thousand; 0 for a circuit breaker.
+        left_s: Seconds until the refusal ends, the last one for several requests.
     """
 
     service: str
@@ -93,7 +94,7 @@ class Block:
 
 
 class CircuitBreaker:
-    """What one worker knows of crashing requests and services."""
+    """The crashes and overruns of the sandboxes of one worker, and the refusals that follow from them."""
 
     def __init__(self, settings: ServiceSettings, *, poison_crashes: int = POISON_CRASHES) -> None:
         self._settings = settings
@@ -103,7 +104,7 @@ class CircuitBreaker:
         self._breakers: dict[tuple[str, Scope], _Breaker] = {}
 
     def refusal(self, robot: RobotId, service: str, digest: str, now: float) -> Poison | WorkerLost | None:
-        """Return why *robot* may not run the request with this digest now, None if it may."""
+        """Return the error with which the request with this digest is refused to *robot*; None runs it."""
         ends = self._ends_of_request.get((service, digest), ())
         if ends and any(self._poison_until(scope, ends) > now for scope in _scopes_of(robot)):
             return Poison(
@@ -138,7 +139,7 @@ class CircuitBreaker:
         return sorted({service for service, scope in shared if not isinstance(scope, RobotId)})
 
     def blocks(self, now: float) -> list[Block]:
-        """Return all blocks of now, those of most robots first, and then by name."""
+        """Return all refusals at *now* (s), those to most robots first, and then by name."""
         blocks = [
             _block(service, scope, "overruns" if breaker.overruns else "crashes", 0, breaker.until_s - now)
             for (service, scope), breaker in self._breakers.items()
@@ -158,13 +159,13 @@ class CircuitBreaker:
     def unblock(
         self, now: float, *, service: str | None = None, tenant: str | None = None, robot: str | None = None
     ) -> list[Block]:
-        """Lift the matching blocks, forget the evidence for them, and return them.
+        """Lift the matching refusals, forget the crashes that caused them, and return them.
 
         Args:
-            now: The time.
-            service: Its name; None means every service.
-            tenant: Lift only what concerns this tenant or a robot of it; None means everything.
-            robot: Name of a robot of *tenant*; lift only what concerns this robot.
+            now: Monotonic seconds.
+            service: Name of a service; None means every service.
+            tenant: Lift only refusals to this tenant or to a robot of it; None means all.
+            robot: Name of a robot of *tenant*; lift only refusals to this robot.
         """
 
         def matches(name: str, block_tenant: str | None, block_robot: str | None) -> bool:
@@ -187,7 +188,7 @@ class CircuitBreaker:
         return lifted
 
     def _count(self, service: str, end: _End) -> None:
-        """Count the *end* of a sandbox for and against everybody whom it may concern."""
+        """Count the *end* of a sandbox, and open the circuit breakers that follow from it."""
         ends = self._ends_of_service.setdefault(service, deque(maxlen=_MAX_ENDS_OF_SERVICE))
         ends.append(end)
         while ends[0].at_s < end.at_s - WINDOW_S:
@@ -219,7 +220,10 @@ class CircuitBreaker:
 
 
 def _evidence_since(scope: Scope, ends: Sequence[_End], count: int) -> float:
-    """Return when the shortest run of the latest *ends* begins that is evidence in *scope*; -inf for none."""
+    """Return the start of the shortest run of the latest *ends* that justifies a refusal to *scope*.
+
+    It is -inf if there is none.
+    """
     robots, ends_in_scope = set[RobotId](), 0
     for end in reversed(ends):
         if scope in _scopes_of(end.robot) and (end.is_crash or isinstance(scope, RobotId)):
@@ -244,7 +248,7 @@ def _scopes_of(robot: RobotId) -> tuple[Scope, ...]:
 
 
 def _tenant_and_name(scope: Scope) -> tuple[str | None, str | None]:
-    """Return tenant and name of the robots of *scope*, None where they are any."""
+    """Return tenant and name of the robots of *scope*; None means any."""
     return (scope.tenant, scope.name) if isinstance(scope, RobotId) else (scope, None)
 
 
@@ -261,7 +265,7 @@ def _refusal_of(service: str, breaker: _Breaker, left_s: float) -> WorkerLost:
         hint = "allow it more time: send a longer deadline"
     else:
         how = "crashed repeatedly"
-        hint = "tell the operator; the server's log has the crashes"
+        hint = "report it to the operator; the server's log has the crashes"
     return WorkerLost(
         f"service {service!r} {how} and is refused for another {left_s:.0f} s",
         hint=hint,

@@ -49,14 +49,11 @@ __all__ = [
     "SendMessage",
 ]
 
-START_TIMEOUT_S = 5.0
-"""A sandbox that is not ready by then is killed."""
-_MAX_TRIES = 2
-_BUSY_RETRY_MS = 1000.0
-_KEPT_S = 3.0
-"""A robot that was refused for want of a sandbox has asked again within this time."""
-_DEADLINE_FACTOR = 2.0
-"""A sandbox is killed when a command takes this many deadlines."""
+START_TIMEOUT_S = 5.0  # a sandbox that is not ready within this time is killed
+_MAX_TRIES = 2  # of a command whose sandbox crashed: the crash may have had another cause
+_BUSY_RETRY_MS = 1000.0  # pause of a robot that gets no sandbox
+_KEPT_S = 3.0  # a free place is kept for a tenant: its refused robot has sent again within this time
+_DEADLINE_FACTOR = 2.0  # a sandbox is killed when its command has taken this many times its deadline
 
 
 @dataclass(eq=False, slots=True)
@@ -336,7 +333,7 @@ class SandboxPolicy:
     def on_store_reply(
         self, number: int, call: SandboxCall, outcome: bytes | BaseException | None, now: float
     ) -> list[Action]:
-        """Follow the store: it read a snapshot (None if there is none), saved one (None), or failed.
+        """Follow a reply of the store: a snapshot (None if there is none), a saved one (None), or an error.
 
         A Conflict means that it holds a newer snapshot: the robot's state was changed on another server.
         """

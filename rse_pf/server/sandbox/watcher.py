@@ -13,13 +13,13 @@ from rse_pf.processes.linux import page_table_bytes, proportional_bytes, residen
 
 __all__ = ["MemoryWatcher"]
 
-_SOONEST_S, _LATEST_S = 0.02, 0.25
-_FASTEST_GROWTH = 2 << 30
-"""Bytes per second: a core does not fill new pages faster than this."""
+_MIN_INTERVAL_S = 0.02  # between two measurements, which take CPU time themselves
+_MAX_INTERVAL_S = 0.25  # between two measurements of sandboxes that are far below their limits
+_MAX_GROWTH_BYTES_PER_S = 2 << 30  # a core fills new pages at most this fast
 
 
 class MemoryWatcher:
-    """Look at sandboxes often enough that none passes its limit by more than a tenth unseen."""
+    """Measure sandboxes so often that none exceeds its limit by more than a tenth unnoticed."""
 
     def __init__(self, memory_bytes: int, *, proc: Path = Path("/proc")) -> None:
         """Keep the limit.
@@ -30,19 +30,19 @@ class MemoryWatcher:
         """
         self._limit = memory_bytes
         self._proc = proc
-        self._next_s = _LATEST_S
+        self._next_s = _MAX_INTERVAL_S
 
     @property
     def interval_s(self) -> float:
-        """Time until the next look: short when a sandbox of the last look was close to its limit."""
+        """Seconds until the next measurement: short if a sandbox was close to its limit at the last one."""
         return self._next_s
 
     def look(self, pids: list[int]) -> tuple[dict[int, str], float]:
-        """Return what `find_excess` returns, and the time until the next look."""
+        """Return the result of `find_excess`, and the seconds until the next measurement."""
         return self.find_excess(pids), self.interval_s
 
     def find_excess(self, pids: list[int]) -> dict[int, str]:
-        """Return the reason for each of *pids*, first processes of sandboxes, that uses too much memory."""
+        """Return a reason for each sandbox above its limit; *pids* are the first processes of sandboxes."""
         reasons = {}
         least = self._limit
         for pid in pids:
@@ -51,7 +51,7 @@ class MemoryWatcher:
                 reasons[pid] = f"it used {used} bytes of memory, the limit is {self._limit}"
             else:
                 least = min(least, self._limit - used)
-        self._next_s = max(_SOONEST_S, min(_LATEST_S, least / _FASTEST_GROWTH))
+        self._next_s = max(_MIN_INTERVAL_S, min(_MAX_INTERVAL_S, least / _MAX_GROWTH_BYTES_PER_S))
         return reasons
 
     def used_bytes(self, pid: int) -> int:

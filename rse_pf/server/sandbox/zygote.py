@@ -1,7 +1,7 @@
-"""The fork server of sandboxes, started by a worker.
+"""The fork server (zygote) of sandboxes, started by a worker.
 
-It imports once what services need, so that a fork starts without imports.  It starts no thread and no event
-loop, runs no service itself, and ends with its worker, together with every sandbox.
+It imports the modules that services need, so that a forked sandbox starts without imports.  It has no thread
+and no event loop, runs no service itself, and exits with its worker, together with every sandbox.
 """
 
 from __future__ import annotations
@@ -27,15 +27,13 @@ from rse_pf.services.custom.verified_copy import PrivateFolder, VerifiedCopy
 __all__ = ["run"]
 
 _GO = b"g"
-_SLOTS = 500
-"""User ids of one zygote; the next zygote's begin after them."""
-_FIRST_UID = 1_000_000
-"""Sandboxes of a server that runs as root get user ids from here."""
-_MAX_THREADS = 64
+_SLOTS = 500  # user ids of one zygote; those of the next one follow
+_FIRST_UID = 1_000_000  # sandboxes of a server that runs as root get user ids from here, unused by accounts
+_MAX_THREADS = 64  # threads of one sandbox, so that a service cannot exhaust the process ids of the machine
 
 
 def run(worker: socket.socket) -> None:
-    """Fork sandboxes until the worker is gone."""
+    """Fork sandboxes until the worker has exited."""
     config, _ = read_packet(worker)
     if config is not None:
         _Zygote(config).run(worker)
@@ -81,9 +79,9 @@ class _Zygote:
         has_cgroup = "memory" in self._cgroups.controllers
         self._watch = None if has_cgroup else MemoryWatcher(total_bytes).look
         self._slots: dict[int, int] = {}
-        """Which user id each sandbox has, by number."""
+        """User id of each sandbox, by number."""
         self._starts: dict[int, int] = {}
-        """Pipes by which sandboxes are told that their pid is known, by number."""
+        """Pipes on which sandboxes wait until their process id is known, by number."""
 
     def run(self, worker: socket.socket) -> None:
         plan = ForkPlan(fork=self._fork, begin=self._begin, free=self._free, watch=self._watch)
@@ -156,7 +154,7 @@ class _Zygote:
     def _fork_inside(
         self, plan: SandboxPlan, channel: int, output: int, uid: int | None, pid_write: int, go_read: int
     ) -> None:
-        """Enter the namespaces, fork the sandbox, tell its pid and exit.
+        """Enter the namespaces, fork the sandbox, report its process id and exit.
 
         A session of its own: Linux shares the processor between sessions (`sched_autogroup_enabled`), so that
         the threads of a sandbox weigh no more than one.  And a stopped process in the server's process group

@@ -1,4 +1,4 @@
-"""The worker's side of the `zygote`: start it, order sandboxes, learn how they ended.
+"""Control the `zygote` from its worker: start it, order sandboxes, and get reports of their ends.
 
 Only the first start blocks; orders to a zygote that is restarted wait in its channel.
 """
@@ -22,10 +22,8 @@ from rse_pf.services.custom.installed import InstalledService
 
 __all__ = ["ZygoteClient"]
 
-SCRATCH_BYTES = 1 << 24
-"""Scratch folder of one sandbox, in its memory; it holds at most one file per 4,096 bytes of this."""
-_END_S = 0.5
-"""Time that a zygote has to end its sandboxes before it is killed."""
+SCRATCH_BYTES = 1 << 24  # scratch folder of one sandbox, in its memory; it has one inode for 4,096 bytes
+_END_S = 0.5  # a zygote has this long to end its sandboxes before it is killed
 
 
 class ZygoteClient:
@@ -52,7 +50,7 @@ class ZygoteClient:
             on_gone: Called with the number of a sandbox that ended, and how it ended.
             on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting.
             on_ready: If given, `start` does not block: it is called once, with the means of isolation that
-                are missing, or with None if the zygote ended before.  The caller judges them.
+                are missing, or with None if the zygote ended before.  The caller decides whether to go on.
         """
         self._services = services
         self._settings = settings
@@ -86,7 +84,7 @@ class ZygoteClient:
         return True
 
     def end(self, number: int) -> None:
-        """Have sandbox *number* killed; one that is gone already is no error."""
+        """Order that sandbox *number* is killed; it is no error if it has ended already."""
         with contextlib.suppress(OSError):
             send_order(self._process, "end", number)
 
@@ -107,7 +105,7 @@ class ZygoteClient:
         self._stop()
 
     def retire(self) -> None:
-        """Do the same without waiting for it."""
+        """End the zygote and every sandbox without waiting for it."""
         self._loop.remove_reader(self._channel.fileno())
         self._channel.close()
         self._forget_all()
@@ -137,7 +135,8 @@ class ZygoteClient:
         }  # fmt: skip
         # No credentials, and no threads of the linear algebra library: it will be forked.  Each arena of the
         # allocator takes 64 MiB of address space, which is limited; with one for each thread, 7 threads fit.
-        # Nothing is imported from the folder in which the server was started: it may be a stranger's service.
+        # Nothing is imported from the folder in which the server was started: it may contain a service of
+        # somebody else.
         variables = {
             "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1",
             "MALLOC_ARENA_MAX": "2", "PYTHONSAFEPATH": "1",
