@@ -28,8 +28,7 @@ from rse_pf.server.sandbox.policy import (
     CreateSandbox,
     KillSandbox,
     LoadSnapshot,
-    LogCrash,
-    LogOverrun,
+    LogEnd,
     ReleaseSandbox,
     SandboxCall,
     SandboxPolicy,
@@ -257,10 +256,10 @@ class SandboxManager:
                 self._ask_store(number, call, _load)
             case SaveSnapshot(number, call, expected, data):
                 self._ask_store(number, call, _save, expected, data)
-            case LogCrash(robot, service, reason):
-                self._log.error("sandbox-crashed", robot=robot, service=service, reason=reason)
-            case LogOverrun(robot, service, reason):
-                self._log.warning("sandbox-overran", robot=robot, service=service, reason=reason)
+            case LogEnd(robot, service, reason, is_crash):
+                event = "sandbox-crashed" if is_crash else "sandbox-overran"
+                write = self._log.error if is_crash else self._log.warning
+                write(event, robot=robot, service=service, reason=reason)
 
     def _create(self, number: int, robot: RobotId) -> None:
         channel = self._channels[number] = IpcChannel(

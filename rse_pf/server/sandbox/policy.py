@@ -39,8 +39,7 @@ __all__ = [
     "CreateSandbox",
     "KillSandbox",
     "LoadSnapshot",
-    "LogCrash",
-    "LogOverrun",
+    "LogEnd",
     "ReleaseSandbox",
     "SandboxCall",
     "SandboxPolicy",
@@ -138,21 +137,16 @@ class AnswerCall:
 
 
 @dataclass(frozen=True, slots=True)
-class LogCrash:
-    """Log that a sandbox crashed; *service* is "" if it ran none."""
+class LogEnd:
+    """Log that a sandbox crashed, or was killed because the deadline of its robot had passed.
+
+    ``service`` is "" if it ran none.
+    """
 
     robot: RobotId
     service: str
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class LogOverrun:
-    """Log that a sandbox was killed because its robot's deadline had passed."""
-
-    robot: RobotId
-    service: str
-    reason: str
+    is_crash: bool
 
 
 Action = (
@@ -163,8 +157,7 @@ Action = (
     | LoadSnapshot
     | SaveSnapshot
     | AnswerCall
-    | LogCrash
-    | LogOverrun
+    | LogEnd
 )
 
 
@@ -471,12 +464,8 @@ class SandboxPolicy:
         self._count_work(sandbox, now)
         self._release(sandbox)
         service, reason = "" if call is None else call.service, f"{why} ({how})"
-        if sandbox.is_overrun:
-            self.counts["overran"] += 1
-            self._actions.append(LogOverrun(sandbox.robot, service, reason))
-        else:
-            self.counts["crashed"] += 1
-            self._actions.append(LogCrash(sandbox.robot, service, reason))
+        self.counts["overran" if sandbox.is_overrun else "crashed"] += 1
+        self._actions.append(LogEnd(sandbox.robot, service, reason, is_crash=not sandbox.is_overrun))
         if call is not None:
             if sandbox.is_overrun:
                 self.breaker.note_overrun(sandbox.robot, service, now)

@@ -72,8 +72,7 @@ from rse_pf.server.supervisor.orders import (
     WorkerOrder,
     decode_order,
 )
-from rse_pf.server.supervisor.robot_events import RobotEvents
-from rse_pf.server.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
+from rse_pf.server.supervisor.robot_reports import MAX_ROBOT_ROWS, RobotEvents, robot_rows
 from rse_pf.services.custom.installed import InstalledService, installed_services, packaged_services
 from rse_pf.services.loading import load_services
 from rse_pf.storage.object_store import ObjectStore

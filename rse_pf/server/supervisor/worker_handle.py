@@ -76,7 +76,7 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
     try:
         for plan in plans:
             channels = [end for worker in workers for end in worker.channels]
-            workers.append(WorkerProcess(plan, unshared=[listener, *channels]))
+            workers.append(WorkerProcess(plan).start(unshared=[listener, *channels]))
     except OSError:
         for worker in workers:
             worker.kill()
@@ -85,13 +85,14 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
 
 
 class WorkerProcess:
-    """One worker process, forked at once; `connect` waits until it is ready.
+    """One worker process: `start` forks it, and `connect` waits until it takes sockets.
 
     ``channels`` are the supervisor's ends of both channels, ``pid`` is the process id.
     """
 
-    def __init__(self, plan: WorkerPlan, *, unshared: Sequence[socket.socket]) -> None:
-        """Fork.  The child closes *unshared*: the sockets of its parent that it must not hold."""
+    def __init__(self, plan: WorkerPlan) -> None:
+        """Describe the process."""
+        self._plan = plan
         self.load = 0
         self.is_ready = False
         self.cpu_s = 0.0
@@ -100,20 +101,27 @@ class WorkerProcess:
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
         self.gone = asyncio.Event()
-        self._data, data = socket.socketpair()
-        self._control, control = socket.socketpair()
-        self.channels = (self._data, self._control)
         self._exit_code: int | None = None
-        with data, control:
-            self.pid = os.fork()
-            if self.pid == 0:
-                _be_worker(plan, data, control, [*unshared, *self.channels])
-        self._data.setblocking(False)
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
         self._rows: asyncio.Future[dict[str, Any]] | None = None
         self._rows_number = 0
+
+    def start(self, *, unshared: Sequence[socket.socket]) -> WorkerProcess:
+        """Fork the process, and return this object.
+
+        The child closes *unshared*: the sockets of its parent that it must not hold.
+        """
+        self._data, data = socket.socketpair()
+        self._control, control = socket.socketpair()
+        self.channels = (self._data, self._control)
+        with data, control:
+            self.pid = os.fork()
+            if self.pid == 0:
+                _be_worker(self._plan, data, control, [*unshared, *self.channels])
+        self._data.setblocking(False)
+        return self
 
     def exit_code(self, how: int = os.WNOHANG) -> int | None:
         """Return the exit code of the process (negative for a signal), None while it runs.

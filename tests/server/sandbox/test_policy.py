@@ -17,8 +17,7 @@ from rse_pf.server.sandbox.policy import (
     CreateSandbox,
     KillSandbox,
     LoadSnapshot,
-    LogCrash,
-    LogOverrun,
+    LogEnd,
     ReleaseSandbox,
     SandboxCall,
     SandboxPolicy,
@@ -103,7 +102,7 @@ def test_a_stateless_command_whose_sandbox_crashed_is_tried_once_more_in_a_new_o
     actions = policy.on_exit(1, "signal SIGSEGV", 1.0)
 
     assert actions == [
-        ReleaseSandbox(1), LogCrash(A, "icp", "signal SIGSEGV (signal SIGSEGV)"), CreateSandbox(2, A)
+        ReleaseSandbox(1), LogEnd(A, "icp", "signal SIGSEGV (signal SIGSEGV)", True), CreateSandbox(2, A)
     ]  # fmt: skip
     assert policy.on_ready(2, 1.5) == [SendMessage(2, b"x")]
     assert outcomes(policy.on_reply(2, OK, 2.0)) == [(call, "ok")]
@@ -278,7 +277,7 @@ def test_what_a_sandbox_says_while_it_is_being_killed_is_too_late():
     assert policy.on_violation(1, "it sent an invalid message") == []
     actions = policy.on_exit(1, "signal SIGKILL", 2.1)
 
-    assert LogOverrun(A, "icp", "it took too long (signal SIGKILL)") in actions
+    assert LogEnd(A, "icp", "it took too long (signal SIGKILL)", False) in actions
     assert policy.on_ready(created(actions), 2.2) == [SendMessage(2, b"2")]
 
 
@@ -312,7 +311,7 @@ def test_a_sandbox_that_does_not_start_in_time_is_killed():
     actions = policy.on_exit(1, "signal SIGKILL", START_TIMEOUT_S)
 
     assert outcomes(actions) == [(call, "worker-lost")]
-    assert LogCrash(A, "", "it did not start in time (signal SIGKILL)") in actions
+    assert LogEnd(A, "", "it did not start in time (signal SIGKILL)", True) in actions
 
 
 def test_a_sandbox_that_violates_the_protocol_is_killed():

@@ -1,10 +1,12 @@
-"""Workers tell their supervisor of robots in batches; nothing is lost, and the order is kept."""
+"""Workers report robots to their supervisor: events in batches, and a list without anything secret."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
-from rse_pf.server.supervisor.robot_events import RobotEvents
+from rse_pf.identity import RobotId
+from rse_pf.server.supervisor.robot_reports import RobotEvents, robot_rows
 from tests.kit.fakes import FakeLoop
 
 LINE_BYTES = 1 << 20
@@ -70,3 +72,34 @@ def test_what_is_held_is_sent_before_the_worker_ends() -> None:
     bench.loop.advance(1.0)
 
     assert bench.messages == [[{"event": "left", "number": 1}]], "once, although its timer was set"
+
+
+def connection(name: str, tenant: str = "default", **changed: Any) -> Any:
+    fields = {
+        "robot": RobotId(tenant, name), "session": SimpleNamespace(codec=SimpleNamespace(name="bin")),
+        "opened_s": 10.0, "commands": 3, "last_result": "busy", "is_shown": True, "is_closing": False,
+        **changed,
+    }  # fmt: skip
+    return SimpleNamespace(**fields)
+
+
+def test_robots_are_listed_by_tenant_and_name_with_the_age_of_their_connections() -> None:
+    rows = robot_rows([connection("b"), connection("a"), connection("z", "another")], 12.5)
+
+    assert [(row["tenant"], row["robot"]) for row in rows] == [
+        ("another", "z"), ("default", "a"), ("default", "b"),
+    ]  # fmt: skip
+    assert rows[1] == {
+        "robot": "a", "tenant": "default", "codec": "bin", "connected_s": 2.5, "commands": 3,
+        "last_result": "busy",
+    }  # fmt: skip
+
+
+def test_sockets_that_are_no_robots_yet_or_any_more_are_left_out() -> None:
+    others = [
+        connection("a", session=None),
+        connection("b", is_shown=False),
+        connection("c", is_closing=True),
+    ]
+
+    assert robot_rows(others, 12.5) == []
