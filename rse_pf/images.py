@@ -1,7 +1,6 @@
-"""Load OpenCV, and read images with it that may come from a stranger.
+"""Load OpenCV, and decode images that may be untrusted.
 
-An image in memory is judged by its head before anything of it is decoded.  Nothing here looks at what an
-image shows.
+The header of an image in memory is checked before anything of it is decoded.
 """
 
 from __future__ import annotations

@@ -31,12 +31,11 @@ __all__ = ["MAX_HEADERS", "MAX_HEAD_BYTES", "OneRequestProtocol", "bounded_proto
 
 MAX_HEAD_BYTES = 16384  # of one request: a token, the longest header, has at most 4 KiB
 MAX_HEADERS = 64  # of one request: browsers and load balancers send fewer than 30
-# A chunked body may be longer than its data by these bytes and an eighth: each chunk costs CPU.
-MAX_FRAMING_BYTES = 4096
-FRAMING_SHIFT = 3
+MAX_FRAMING_BYTES = 4096  # framing of a chunked body, apart from `FRAMING_SHIFT`: each chunk costs CPU time
+FRAMING_SHIFT = 3  # framing may also take an eighth (2**-3) of the data
 PARSED_AT_ONCE_BYTES = 16384  # bytes of a chunked body between two checks of its framing
-UNSENT_HIGH_BYTES = 1 << 19  # of a reply: the application waits for a client that has not read so many
-UNSENT_LOW_BYTES = 1 << 18  # of a reply: the application goes on when no more than these wait
+UNSENT_HIGH_BYTES = 1 << 19  # the application pauses when a client has not read this much of a reply
+UNSENT_LOW_BYTES = 1 << 18  # the application continues when no more than this is unread
 _END_OF_HEAD = b"\r\n\r\n"
 _HEAD = re.compile(
     rb"[A-Z]{1,16} /[!\"$-~]* HTTP/1\.1\r\n"  # no fragment: readers differ in what they do with "#"
@@ -57,9 +56,9 @@ def bounded_protocol(
     Args:
         seconds: Time for the head of a request, from the connection or from the head's first byte.
         idle_s: Time between an answer and the next request.
-        most: Connections that have sent no whole head; above that the oldest is cut.
-        most_idle: Connections that were answered and wait; above that the one that waited longest is closed.
-        ends_with_client: Cancel the application when the client is gone.
+        most: Connections that have sent no whole head; above that the oldest is closed.
+        most_idle: Idle connections after a reply; above that the one that is idle for longest is closed.
+        ends_with_client: Cancel the application when the client has disconnected.
 
     Raises:
         MissingExtra: uvicorn or httptools is not installed.
@@ -107,7 +106,7 @@ class OneRequestProtocol(HttpToolsProtocol):
         self._silent.enter(self, transport.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Report to the application that its client is gone."""
+        """Report to the application that its client has disconnected."""
         self._silent.leave(self)
         self._idle.leave(self)
         super().connection_lost(exc)
@@ -171,7 +170,7 @@ class OneRequestProtocol(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Take a part of a body, which pays for its framing."""
+        """Take a part of a body, and allow more framing for it."""
         self._framing_bytes_left += len(body) + (len(body) >> FRAMING_SHIFT)
         super().on_body(body)
 
@@ -192,7 +191,7 @@ class OneRequestProtocol(HttpToolsProtocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def _parse_body(self, data: bytes) -> None:
-        """Parse what follows a head, and bound its framing."""
+        """Parse what follows a head, and refuse too much chunk framing."""
         step = PARSED_AT_ONCE_BYTES if self._is_chunked else max(len(data), 1)
         for start in range(0, len(data), step):
             if self.transport.is_closing():

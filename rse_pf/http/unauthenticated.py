@@ -1,7 +1,8 @@
-"""Connections that have not said who they are: a bounded number, each for a bounded time.
+"""Bound the number and the age of connections that have not sent their first whole request.
 
-What an open socket costs before its first whole request is what a stranger can make a server spend.  Every
-listener of the platform counts such connections here.  Nothing is read and nothing is judged here.
+An unauthenticated client can make a server spend what such a connection costs.  Each listener of the platform
+counts these connections here, and closes the oldest ones.  This module neither reads requests nor checks
+tokens.
 """
 
 from __future__ import annotations
@@ -26,31 +27,31 @@ __all__ = [
 ]
 
 FIRST_REQUEST_S = 6.0
-"""Time from the acceptance of a connection to its first whole head of a request, or hello.  With the waits
-before the acceptance, and for the close among 5,000 others, a silent client is gone after ten seconds."""
+"""Time from the acceptance of a connection to its first whole request head or Hello.  With 5,000 silent
+connections, waiting for acceptance and closing take up to four seconds more: ten seconds in all."""
 BACKLOG = 4096
-"""Connections that wait to be accepted: above that the kernel drops them, also those of robots, and they are
-tried again after 1 and 3 s.  The kernel cuts it to net.core.somaxconn."""
+"""Connections that wait for acceptance.  Above that the kernel drops connections, those of robots included,
+and clients retry after 1 and 3 s.  The kernel limits the value to net.core.somaxconn."""
 KEEP_ALIVE_S = BALANCER_IDLE_TIMEOUT_S + 10.0
-"""How long a served connection may be idle: longer than load balancers keep theirs, which would otherwise
-send a request into a connection that is just being closed."""
+"""How long a connection may be idle after a reply.  It exceeds the idle timeout of load balancers, which
+otherwise send requests on connections that are being closed."""
 MAX_SILENT = 256
-"""Silent connections of one listener."""
+"""Connections of one listener that have sent no whole request; robots send theirs within milliseconds."""
 _MAX_ACCEPTED_AT_ONCE = 32
-"""Connections that are accepted in one round of the event loop."""
+"""Connections that are accepted in one round of the event loop, so that others are served in between."""
 _MAX_SILENT_TLS = 128
-"""Silent connections of one listener with TLS, whose handshake holds some 300 KiB each."""
-_PAUSE_S = 0.2
-"""After the system refused to accept: it has no descriptor left."""
+"""As `MAX_SILENT`, for a listener with TLS, where a handshake takes some 300 KiB of memory."""
+_ACCEPT_PAUSE_S = 0.2
+"""Pause after accept failed: the process has no file descriptor left until a connection is closed."""
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 class PendingHandshakes(Generic[Key]):
-    """Sockets that have not sent a token yet; when there are too many, the one that waited longest is cut.
+    """Sockets that have not sent a token yet; above a limit, the one that waited longest is closed.
 
-    A robot sends its token within milliseconds, so the socket that waited longest is least likely to be one.
-    If the newest were cut instead, a few silent sockets would lock the robots out.
+    A robot sends its token within milliseconds, so the socket that waited longest is least likely a robot's.
+    If the newest socket were closed instead, a few silent sockets would lock robots out.
     """
 
     def __init__(self, max_sockets: int, max_per_source: int) -> None:
@@ -60,11 +61,11 @@ class PendingHandshakes(Generic[Key]):
         self._of_source: dict[str, dict[Key, None]] = {}
 
     def __len__(self) -> int:
-        """Return how many wait."""
+        """Return the number of sockets."""
         return len(self._sources)
 
     def enter(self, key: Key, source: str) -> Key | None:
-        """Add *key*; return the one to cut for it, if there are too many."""
+        """Add *key*; return the key to close for it, None within the limits."""
         self._sources[key] = source
         own = self._of_source.setdefault(source, {})
         own[key] = None
@@ -78,7 +79,7 @@ class PendingHandshakes(Generic[Key]):
         return leaving
 
     def leave(self, key: Key) -> None:
-        """Forget one that sent a token, or is gone."""
+        """Remove a socket that sent a token, or was closed."""
         source = self._sources.pop(key, None)
         if source is None:
             return
@@ -99,31 +100,34 @@ class SilentConnections(Generic[Key]):
         most: int = MAX_SILENT,
         most_per_source: int = 0,
     ) -> None:
-        """Know of no connection yet.
+        """Count no connection yet.
 
         Args:
-            call_later: Of the event loop.
-            seconds: After this a connection is cut.
-            most: Above this, the connection that has waited longest is cut.
-            most_per_source: The same for one address; 0 is no bound.
+            call_later: Method of the event loop.
+            seconds: Age at which a connection is closed.
+            most: Number of connections above which the oldest is closed.
+            most_per_source: The same for the connections of one address; 0 is no limit.
         """
         self.cut = 0
-        """How many were cut."""
+        """Number of connections that were closed."""
         self._line: PendingHandshakes[Key] = PendingHandshakes(most, most_per_source)
         self._call_later = call_later
         self._seconds = seconds
         self._waiting: dict[Key, tuple[asyncio.TimerHandle, Callable[[], object], str]] = {}
 
     def __len__(self) -> int:
-        """Return how many wait."""
+        """Return the number of connections."""
         return len(self._waiting)
 
     def __contains__(self, key: Key) -> bool:
-        """Return whether *key* waits."""
+        """Return whether the connection *key* is counted."""
         return key in self._waiting
 
     def enter(self, key: Key, cut: Callable[[], object], source: str = "") -> None:
-        """Count the connection *key* from the address *source*, which *cut* ends; one that waits stays."""
+        """Count the connection *key* from the address *source*; *cut* closes it.
+
+        A connection that is counted already keeps its age.
+        """
         if key in self._waiting:
             return
         self._waiting[key] = self._call_later(self._seconds, self._cut, key), cut, source
@@ -132,7 +136,7 @@ class SilentConnections(Generic[Key]):
             self._cut(surplus)
 
     def leave(self, key: Key) -> str | None:
-        """Forget one that sent its request, or is gone; return its address, None if it did not wait."""
+        """Remove a connection that sent its request, or ended; return its address, None if it is unknown."""
         entry = self._waiting.pop(key, None)
         if entry is None:
             return None
@@ -142,7 +146,7 @@ class SilentConnections(Generic[Key]):
         return source
 
     def cut_all(self) -> None:
-        """Cut all of them: the server leaves."""
+        """Close all connections, because the server stops."""
         for key in list(self._waiting):
             self._cut(key)
 
@@ -154,10 +158,10 @@ class SilentConnections(Generic[Key]):
 
 
 class TlsListener:
-    """Accepts connections with TLS; one that sends nothing costs its socket alone.
+    """Accept connections with TLS; a client that sends nothing costs a socket only.
 
-    asyncio makes the objects of TLS, some 300 KiB, when it accepts.  Here they are made when the first bytes
-    have come.
+    asyncio creates the TLS objects, some 300 KiB, when it accepts a connection.  This listener creates them
+    when the first bytes arrive.
     """
 
     def __init__(
@@ -173,11 +177,11 @@ class TlsListener:
         """Accept nothing yet.
 
         Args:
-            listening: A socket that listens; closed by `close`.
-            context: Of a server.
-            serve: A coroutine function; called after the handshake of TLS with reader, writer and a function
-                that it calls when the other side has said who it is.
-            seconds: See `SilentConnections`; the handshake is part of it.
+            listening: A listening socket; `close` closes it.
+            context: TLS context of a server.
+            serve: A coroutine function that is called after the TLS handshake with a reader, a writer, and a
+                function to call when the client has authenticated itself.
+            seconds: See `SilentConnections`; the handshake is included.
             most: See `SilentConnections`.
             most_per_source: See `SilentConnections`.
         """
@@ -191,7 +195,7 @@ class TlsListener:
         )
         self._tasks: set[asyncio.Task[None]] = set()
         self._raw: set[socket.socket] = set()
-        """Sockets of tasks that have not shaken hands."""
+        """Sockets whose TLS handshake is not complete."""
         self._pause: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
@@ -200,7 +204,7 @@ class TlsListener:
         self._loop.add_reader(self._listening.fileno(), self._accept)
 
     def close(self) -> None:
-        """Accept no more, and cut who said nothing; what was served goes on."""
+        """Stop accepting and close unauthenticated connections; the others go on."""
         if self._pause is not None:
             self._pause.cancel()
         self._loop.remove_reader(self._listening.fileno())
@@ -215,7 +219,7 @@ class TlsListener:
                 return
             except OSError:
                 self._loop.remove_reader(self._listening.fileno())
-                self._pause = self._loop.call_later(_PAUSE_S, self.open)
+                self._pause = self._loop.call_later(_ACCEPT_PAUSE_S, self.open)
                 return
             accepted.setblocking(False)
             self.silent.enter(accepted, functools.partial(self._drop, accepted), str(peer[0]))
@@ -227,7 +231,7 @@ class TlsListener:
         accepted.close()
 
     def _begin(self, accepted: socket.socket) -> None:
-        """Shake hands: the first bytes have come, or the end."""
+        """Start the TLS handshake, because the first bytes, or the end of the connection, arrived."""
         self._loop.remove_reader(accepted.fileno())
         source = self.silent.leave(accepted) or ""
         self._raw.add(accepted)
@@ -252,7 +256,7 @@ class TlsListener:
                 ssl_handshake_timeout=self._seconds,
             )  # fmt: skip
         except OSError:
-            return  # it was no TLS, or it has ended
+            return  # the client does not speak TLS, or has closed the connection
         self._raw.discard(accepted)  # the transport closes it
         writer = asyncio.StreamWriter(transport, protocol, reader, self._loop)
         with contextlib.closing(writer):

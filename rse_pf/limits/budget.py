@@ -1,8 +1,8 @@
-"""Judge a stranger's bytes before any object is made from them: size, ratio, depth, counts and memory.
+"""Check untrusted bytes before they are decoded: size, inflated size, nesting, number of values, and memory.
 
-Every decoder of the platform asks here first: bytes go in, and nothing or a typed error comes out.  The
-limits of one kind of input are a `Budget`.  Nothing here decodes: what passes may still be malformed, which
-the decoder reports.
+Each decoder of the platform calls these checks first; they raise LimitExceeded or BadMessage.  The limits of
+one kind of input are a `Budget`.  The checks do not decode: bytes that pass may still be malformed, which the
+decoder reports.
 
 Source:
     MessagePack specification, https://github.com/msgpack/msgpack/blob/master/spec.md, "Formats".
@@ -57,20 +57,21 @@ MESSAGE_VALUES = 31_000
 with their depths in JSON, has 30,000 numbers and less than 100 other values."""
 MESSAGE_MEMORY_BYTES = 2_000_000
 """Estimated memory of a decoded JSON message."""
-LIST_VALUES, MAP_VALUES = 3, 6
-"""How many values a list and a map count as, according to the memory that they take."""
+LIST_VALUES = 3
+"""How many values a list counts as, by the memory that it takes."""
+MAP_VALUES = 6
+"""How many values a map counts as, by the memory that it takes."""
 
-_PIECE_BYTES = 32768
-_FLAT_FROM = 32
-"""Shorter lists are read value by value."""
+_PIECE_BYTES = 32768  # a text is inflated and read in pieces of this size, which fit into the cache of a core
+_FLAT_FROM = 32  # a shorter list is read value by value, which then takes less time than a test of the whole
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
 
 _NOT_BACKSLASH = re.compile(rb"[^\\]")
 
 _SHORT_BYTES = 8192  # no JSON text up to this size exceeds a limit of a message but the depth
-_STRING_BYTES = 60  # memory of a string besides its characters
+_STRING_BYTES = 60  # memory of a string in addition to its characters
 _NUMBER_BYTES = 32  # memory of a number in a list
-_WIDE = 7  # memory of a character, at most, in a text beyond ASCII
+_MAX_CHARACTER_BYTES = 7  # memory of one character of a text that is not ASCII
 # msgspec takes up to 10 us for a number of more than 19 significant digits, up to 45 us for one at the ends
 # of the range of float64, and less than 0.1 us for any other.
 _MAX_LONG_NUMBERS = 400  # of a JSON text, which are read in 4 ms
@@ -245,11 +246,15 @@ def _inflate_rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: 
 
 
 def _not_zlib_error() -> BadMessage:
-    return BadMessage("not a zlib stream", hint="is this the sub-protocol that was agreed?")
+    return BadMessage(
+        "the message is not a zlib stream", hint="send what the agreed sub-protocol of the WebSocket says"
+    )
 
 
 def _not_one_stream_error() -> BadMessage:
-    return BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
+    return BadMessage(
+        "the zlib stream does not end with the message", hint="send one zlib stream in each message"
+    )
 
 
 def _bomb_error(size: int, max_bytes: int) -> LimitExceeded:
@@ -274,7 +279,7 @@ def check_msgpack(data: Text, budget: Budget) -> bool:
     if end <= budget.containers and end * MAP_VALUES <= budget.mixed_values:
         return False
     if measure_msgpack(data, 0, budget) != end:
-        raise _trailing_bytes_error()
+        raise BadMessage("bytes follow the message", hint="send one value in each message")
     return True
 
 
@@ -361,9 +366,9 @@ def small_text(data: Text, at: int) -> tuple[str, int]:
 
 def _check_containers(depth: int, containers: int, budget: Budget) -> None:
     if containers > budget.containers:
-        raise _too_many_containers_error(budget.containers)
+        raise LimitExceeded(f"more than {budget.containers} lists and maps", hint="send raw arrays")
     if depth > budget.depth:
-        raise _too_deep_error(budget.depth)
+        raise LimitExceeded(f"a message is nested deeper than {budget.depth}", hint="send flat lists")
 
 
 def _flat_bytes(data: Text, at: int, count: int) -> int:
@@ -414,18 +419,6 @@ def _too_many_values_error(max_values: int) -> LimitExceeded:
     )
 
 
-def _too_many_containers_error(most: int) -> LimitExceeded:
-    return LimitExceeded(f"more than {most} lists and maps", hint="send arrays, raw")
-
-
-def _too_deep_error(most: int) -> LimitExceeded:
-    return LimitExceeded(f"a message is nested deeper than {most}", hint="send flat lists")
-
-
-def _trailing_bytes_error() -> BadMessage:
-    return BadMessage("bytes follow the message", hint="one value for each message")
-
-
 # --- JSON -----------------------------------------------------------------------------------------
 
 
@@ -438,7 +431,7 @@ def check_json(text: Text, budget: Budget) -> None:
 def check_json_containers(text: Text, budget: Budget) -> None:
     """Raise LimitExceeded if *text* holds more lists and objects, or levels of them, than *budget* allows.
 
-    Brackets inside strings are left out, for which the text is read once more if it has many brackets.
+    Brackets inside strings do not count; a text with many brackets is read once more to exclude them.
     """
     max_depth = budget.depth
     max_lists = budget.containers
@@ -447,15 +440,17 @@ def check_json_containers(text: Text, budget: Budget) -> None:
         return
     brackets = b"".join(_without_strings(text, _NOT_BRACKETS_OR_QUOTES))
     if brackets.count(b"[") + brackets.count(b"{") > max_lists:
-        raise _too_many_json_containers_error(max_lists)
+        raise LimitExceeded(
+            f"JSON of more than {max_lists} lists and objects", hint="send flat lists of numbers"
+        )
     if _depth(brackets) > max_depth:
-        raise _too_deep_json_error(max_depth)
+        raise LimitExceeded(f"JSON is nested deeper than {max_depth}", hint="send flat lists")
 
 
 def check_json_counts(text: Text, budget: Budget) -> None:
     """Raise LimitExceeded if *text* holds more values, long numbers or memory than *budget* allows.
 
-    Marks inside strings count, too, unless that alone would exceed a limit.
+    Commas, colons and brackets inside strings count, too, unless only they exceed a limit.
     """
     if text.count(b"e") + text.count(b"E") > _MAX_EXTREME_NUMBERS:
         _check_exponents(text)
@@ -480,7 +475,7 @@ def _check_exponents(text: Text) -> None:
 def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_strings: bool) -> None:
     """Raise LimitExceeded if *text* exceeds a limit by what its *pieces* hold.
 
-    With *has_strings* the pieces still hold the strings, whose length is not known: all characters count.
+    With *has_strings* the pieces still hold the strings, whose length is unknown, so all characters count.
     """
     marks = containers = long_numbers = outside = 0
     for piece in pieces:
@@ -499,9 +494,12 @@ def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_str
     strings = text.count(b'"') // 2
     characters = len(text) if has_strings else len(text) - outside
     memory = _STRING_BYTES * strings + _NUMBER_BYTES * max(0, marks - strings) + len(text)
-    memory += characters if text.isascii() and b"\\u" not in text else _WIDE * characters
+    memory += characters if text.isascii() and b"\\u" not in text else _MAX_CHARACTER_BYTES * characters
     if memory > budget.memory_bytes:
-        raise _too_much_memory_error(budget.memory_bytes)
+        raise LimitExceeded(
+            f"a message that would take more than {budget.memory_bytes} bytes of memory",
+            hint="send arrays of numbers, or large data to the data server",
+        )
 
 
 def _depth(brackets: Text) -> int:
@@ -523,18 +521,3 @@ def _without_strings(text: Text, dropped: bytes) -> Iterator[bytes]:
         inside = np.logical_xor.accumulate(quotes) ^ is_inside
         yield signs[~(inside | quotes)].tobytes()
         is_inside = bool(inside[-1]) if len(inside) else is_inside
-
-
-def _too_many_json_containers_error(most: int) -> LimitExceeded:
-    return LimitExceeded(f"JSON of more than {most} lists and objects", hint="send flat lists of numbers")
-
-
-def _too_deep_json_error(most: int) -> LimitExceeded:
-    return LimitExceeded(f"JSON is nested deeper than {most}", hint="send flat lists")
-
-
-def _too_much_memory_error(max_bytes: int) -> LimitExceeded:
-    return LimitExceeded(
-        f"a message that would take more than {max_bytes} bytes of memory",
-        hint="send arrays of numbers, or large data to the data server",
-    )

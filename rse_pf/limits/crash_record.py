@@ -1,8 +1,8 @@
-"""Count the processes that the bytes of a robot ended, and refuse a robot that ended two of them for a while.
+"""Count the processes that the commands of a robot crashed, and refuse the robot for a while after two.
 
-Only what this robot sent counts, and only against it.  Its own deadline never counts: a command that was
-given too little time says nothing about its bytes.  Time is an argument, and memory is bounded whatever
-robots send.
+A crash counts against the robot whose command caused it, and against no other.  A command that was killed at
+its own deadline does not count: a short deadline is no evidence of harmful bytes.  The caller passes the
+time, and the number of robots that are remembered is bounded.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from rse_pf.identity import RobotId
 __all__ = ["BLOCK_S", "MAX_CRASHES", "WINDOW_S", "CrashRecord"]
 
 WINDOW_S = 300.0
-"""Crashes of a robot that lie further apart do not count together."""
+"""Two crashes of a robot count together if at most this time lies between them."""
 MAX_CRASHES = 2
-"""Number of crashes after which the robot that caused them is refused."""
+"""Crashes after which a robot is refused: one may be an accident."""
 BLOCK_S = 60.0
-"""For this long after the last of them."""
+"""How long a robot is refused after its last crash, so that it costs at most two processes a minute."""
 _MAX_ROBOTS = 10_000
-"""Robots whose crashes are remembered; the one whose last crash is oldest is forgotten first."""
+"""Robots whose crashes are remembered; beyond that, the robot whose last crash is oldest is forgotten."""
 
 
 class CrashRecord:
-    """The crashes that the robots of one server or worker caused; may be used by several threads.
+    """The crashes that the robots of one server or worker caused; several threads may use it.
 
-    A supervisor uses `note_crash` and `blocked` for its workers, a worker `refusal` for limited services.
+    A supervisor calls `note_crash` and `blocked`; a worker calls `refusal` before it runs a limited service.
     """
 
     def __init__(self) -> None:
@@ -42,18 +42,18 @@ class CrashRecord:
         if rest_s <= 0:
             return None
         return Busy(
-            f"commands of this robot ended {MAX_CRASHES} processes; "
-            f"map services are refused to it for another {rest_s:.0f} s",
+            f"commands of this robot crashed {MAX_CRASHES} processes; "
+            f"map services refuse it for another {rest_s:.0f} s",
             hint="send smaller maps; the server's log names the crashes",
             retry_after_ms=rest_s * 1e3,
         )
 
     def note_crash(self, robot: RobotId, now: float) -> bool:
-        """Note that a command of *robot* ended a process; return whether the robot is blocked from now on."""
+        """Count a crash that a command of *robot* caused; return whether the robot is blocked from now on."""
         with self._lock:
             crashes = self._crashes_s.pop(robot, ())
             is_first = not crashes or len(crashes) == MAX_CRASHES or now - crashes[0] > WINDOW_S
-            if _rest_s(crashes, now) <= 0:  # else it was sent before the robot was refused
+            if _rest_s(crashes, now) <= 0:  # otherwise the command was sent before the robot was refused
                 crashes = (now,) if is_first else (*crashes, now)
             self._crashes_s[robot] = crashes
             if len(self._crashes_s) > _MAX_ROBOTS:
@@ -61,7 +61,7 @@ class CrashRecord:
             return len(crashes) == MAX_CRASHES and crashes[-1] == now
 
     def blocked(self, now: float) -> list[tuple[RobotId, float]]:
-        """Return the robots that are refused at *now*, each with the seconds that are left."""
+        """Return the robots that are refused at *now*, each with the seconds until it is accepted again."""
         with self._lock:
             rests_s = [(robot, _rest_s(crashes_s, now)) for robot, crashes_s in self._crashes_s.items()]
         return [(robot, rest_s) for robot, rest_s in rests_s if rest_s > 0]

@@ -1,4 +1,4 @@
-"""Decide whose work is next: fair between tenants, then between the robots of a tenant.
+"""Choose the next item of a queue: fair between tenants, then between the robots of a tenant.
 
 This is hierarchical fair queueing by round robin, with two levels:
 
@@ -151,16 +151,16 @@ class FairQueue(Generic[Item]):
 def largest_holder(
     held: Mapping[RobotId, int], newcomer: RobotId, may_give: Callable[[RobotId], Any]
 ) -> RobotId | None:
-    """Return the robot that gives one place up to *newcomer* where all places are taken; None refuses it.
+    """Return the robot that loses one place to *newcomer* when all places are taken; None refuses *newcomer*.
 
-    It is of the tenant that holds most, and there the robot that holds most: of another tenant that holds at
-    least two more than the newcomer's, or of the same tenant if it holds two more than the newcomer.  With
-    one more, the two would only change places.
+    The robot with the most places, within the tenant with the most places, loses one.  It needs two more
+    places than *newcomer*, or its tenant two more than the tenant of *newcomer*; with one more, the two would
+    only swap.
 
     Args:
-        held: How many places each robot holds.
-        newcomer: Who asks for one more.
-        may_give: Whether a place of a robot can be given up now.
+        held: Number of places of each robot.
+        newcomer: The robot that needs one more place.
+        may_give: Whether a robot can lose a place now.
     """
     of_tenant: Counter[str] = Counter()
     for robot, count in held.items():

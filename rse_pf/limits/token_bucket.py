@@ -27,7 +27,7 @@ class TokenBucket:
 
     def take(self, now: float) -> float:
         """Take one token at *now* (s) and return 0, or return the seconds until one is available."""
-        if now > self.at:  # as `fill` does, without the call: each message of each robot takes a token
+        if now > self.at:  # inlined `fill`, because this method runs for each message of each robot
             self.tokens = min(self.burst, self.tokens + (now - self.at) * self.rate)
             self.at = now
         if self.tokens < 1.0:

@@ -1,4 +1,4 @@
-"""Run a function over a stranger's bytes in processes that have limits and are killed at a timeout.
+"""Run a function on untrusted bytes in processes that have limits and are killed at a timeout.
 
     with LimitedProcesses("rse_pf.maps.describe:describer", ProcessLimits(memory_bytes=1 << 28)) as processes:
         description = processes.call(data, timeout_s=5.0)
@@ -9,9 +9,9 @@ answers one call after the other, so what that function caches stays until its p
 that was killed is replaced in some milliseconds.  `LimitedProcesses.call` blocks and may be called by several
 threads.
 
-Bytes that crash their process, exhaust its memory or its CPU time cost that one process and nothing else, and
-only they raise Crashed: it is evidence against the sender of the bytes, the other errors are not.  This is no
-sandbox: code that took over the process may do what its user may do.
+Bytes that crash their process, or exhaust its memory or CPU time, cost that process only.  Only such bytes
+raise Crashed, which counts against their sender; the other errors do not.  This is no sandbox: code that took
+over the process has the permissions of its user.
 """
 
 from __future__ import annotations
@@ -62,18 +62,22 @@ Handler = Callable[[bytes], bytes]
 DEFAULT_NICENESS = 5
 _MAX_REPLY_BYTES = 1 << 20
 _ORDER_TIMEOUT_S = 10.0
-"""A template that does not fork or kill a process within this is replaced."""
+"""A template that does not fork or kill a process within this time is replaced: it hangs."""
 _BUSY_RETRY_MS = 1000.0
 _NEAR = 4
-"""Kinds of work that a process is remembered for."""
+"""Values of *near* that are remembered for each process, which caches the data of a few only."""
 _OUT_OF_MEMORY = 77
 """Exit code of a process whose handler raised MemoryError."""
-_NO_MEMORY, _NO_TIME = how_ended(_OUT_OF_MEMORY), how_ended(-signal.SIGPROF)
-"""How a process ends by its limits; it arms the signal before each call."""
+_NO_MEMORY = how_ended(_OUT_OF_MEMORY)
+_NO_TIME = how_ended(-signal.SIGPROF)
+"""How a process ends at its CPU limit: it arms the timer of this signal before each call."""
 _LENGTH = struct.Struct("<Q")
 _REPLY = struct.Struct("<BQd")
 """Kind and length of what follows, and the CPU seconds of the process so far."""
-_DONE, _REFUSED, _DEFECT = 0, 1, 2
+# Kinds of a reply: the result, an `RsePfError` of the handler, or another exception of the handler.
+_DONE = 0
+_REFUSED = 1
+_DEFECT = 2
 
 
 class Overran(Expired):
@@ -89,7 +93,7 @@ class ProcessLimits:
     """What one process may use."""
 
     memory_bytes: int
-    """What calls may allocate, beside what the template has allocated."""
+    """What calls may allocate in addition to what the template has allocated."""
     cpu_s: float = 60.0
     """CPU seconds of one call, however busy the machine is; its handler may allow less by `limit_cpu`."""
     max_reply_bytes: int = _MAX_REPLY_BYTES
@@ -108,7 +112,7 @@ class LimitedProcesses:
         count: int = 1,
         niceness: int = DEFAULT_NICENESS,
     ) -> None:
-        """Say what is run and within which limits.
+        """Describe the function and its limits; nothing is started.
 
         Args:
             target: ``module:function``; the function takes *configuration* and returns a `Handler`.
@@ -136,8 +140,8 @@ class LimitedProcesses:
     ) -> bytes:
         """Return the handler's reply to *data*; blocks for at most *timeout_s* seconds, and some ms.
 
-        A call whose process ends, although it had answered other calls before, is repeated once in a new
-        process: what others left there may have been the cause.
+        If a process ends that had answered earlier calls, the call is repeated once in a new process, because
+        an earlier call may be the cause.
 
         Args:
             data: What the handler gets.
@@ -147,10 +151,10 @@ class LimitedProcesses:
             charge: Gets the CPU seconds that the call took, once for each process that worked on it.
 
         Raises:
-            Crashed: *data* ended the process: a limit, or a signal; the message says which.
+            Crashed: *data* ended the process by a limit or a signal, which the message names.
             Overran: *timeout_s* passed during the work, and the process was killed.
             Busy: *timeout_s* passed before a process was free or had been started.
-            WorkerLost: The processes cannot be started, or were closed; *data* has no part in it.
+            WorkerLost: The processes cannot be started, or were closed; *data* is not the cause.
             InternalError: The handler raised an exception that is none of the platform's.
             RsePfError: What the handler raised.
         """

@@ -1,6 +1,6 @@
-"""What the project asks Linux about processes, and changes of them: their end, name, priority and limits.
+"""Read and change properties of Linux processes: their end, name, priority and limits.
 
-A process that is gone is no error: it has no CPU seconds and no memory, and its priority cannot be changed.
+A process that has exited is no error: its CPU seconds and its memory are 0, and its priority stays.
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ def be_killed_first() -> None:
 
 
 def limit_memory(memory_bytes: int, *, beyond_now: bool = False) -> None:
-    """Limit what this process may allocate (*beyond_now*: beside what it has), and forbid core files."""
+    """Limit what this process may allocate, and forbid core files.
+
+    With *beyond_now* the limit applies to what is allocated from now on.
+    """
     if beyond_now:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5])
         memory_bytes += pages * os.sysconf("SC_PAGE_SIZE")
@@ -72,7 +75,7 @@ def close_other_descriptors(keep: int) -> None:
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return the user and system CPU seconds of *pid* and its reaped children, 0 if it is gone."""
+    """Return the user and system CPU seconds of *pid* and its reaped children, 0 if it has exited."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -87,7 +90,7 @@ def disk_free_percent(folder: str = ".") -> float:
 
 
 def resident_bytes(pid: int) -> int:
-    """Return the resident memory of *pid*, 0 if it is gone."""
+    """Return the resident memory of *pid*, 0 if it has exited."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     except OSError:
@@ -96,7 +99,7 @@ def resident_bytes(pid: int) -> int:
 
 
 def page_table_bytes(pid: int) -> int:
-    """Return the memory that the kernel needs for the page tables of *pid*, 0 if it is gone."""
+    """Return the memory that the kernel needs for the page tables of *pid*, 0 if it has exited."""
     return 1024 * _kilobytes(f"/proc/{pid}/status", "VmPTE")
 
 
@@ -104,7 +107,7 @@ def proportional_bytes(pid: int) -> int:
     """Return the memory that Linux charges to *pid*: its pages, shared ones in part, swap and page tables.
 
     Of a process that this user may not look into, shared pages count in full and files do not.  0 if it
-    is gone.
+    has exited.
     """
     try:
         pages = _kilobytes(f"/proc/{pid}/smaps_rollup", "Pss", "SwapPss")
@@ -125,7 +128,7 @@ def run_as_batch(pid: int, nice: int) -> None:
 
 
 def _kilobytes(file: str, *names: str) -> int:
-    """Return the sum of the lines *names* of a file in procfs, 0 if its process is gone."""
+    """Return the sum of the lines *names* of a file in procfs, 0 if its process has exited."""
     try:
         lines = Path(file).read_text().splitlines()
     except PermissionError:

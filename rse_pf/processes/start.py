@@ -99,7 +99,7 @@ def start_child(
         plan: What it runs.
         environment: Its variables; None for those of this process.
         kind: Of the socket to it.
-        descriptors: Open files that it inherits beside its socket and the standard ones.
+        descriptors: Open files that it inherits in addition to its socket and the standard ones.
         output: Where standard output and error go; None for those of this process.
 
     Raises:
@@ -128,7 +128,7 @@ def start_child(
 
 
 def how_ended(code: int) -> str:
-    """Return what an exit code says, as part of a sentence."""
+    """Describe an exit code as part of a sentence."""
     if code >= 0:
         return f"exit code {code}"
     return f"signal {signal.Signals(-code).name if -code in set(signal.Signals) else -code}"

@@ -2,7 +2,7 @@
 
 The record changes by compare-and-swap only, so of two processes that claim it one succeeds.  The
 owner renews it; others watch it with their own clocks, so that the clocks of two machines are never compared.
-What the record says, and when it may be claimed, is decided by those who use it.
+Users of this module define the fields of the record, and when another process may claim it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def read_record(store: ObjectStore, name: str) -> bytes | None:
 
 
 class OwnedRecord(Protocol):
-    """What every record says: who owns it, in which state, and how often it was renewed."""
+    """The fields that every record has: its owner, its state, and the number of its renewals."""
 
     @property
     def owner(self) -> str:
@@ -72,7 +72,7 @@ class Lease(Generic[R]):
         self._clock = clock
         self._changed_s = clock()
         self._written_s = float("-inf")
-        self._heard = -1
+        self._reported_beat = -1
 
     @property
     def unchanged_s(self) -> float:
@@ -88,41 +88,45 @@ class Lease(Generic[R]):
         """Read the record; raises StoreError."""
         return self.note(read_record(self._store, self.name))
 
-    def note(self, found: bytes | None) -> R | None:
-        """Take what was read from the store; a renewal that the owner has told is no change."""
-        if found == self.known:
+    def note(self, stored: bytes | None) -> R | None:
+        """Note what was read from the store.
+
+        A renewal that the owner has reported by `note_beat` before is no change.
+        """
+        if stored == self.known:
             return self.record
         before = self.record
-        now = None if found is None else self._decode(self.name, found)
-        self.known, self.record = found, now
+        now = None if stored is None else self._decode(self.name, stored)
+        self.known, self.record = stored, now
         if before is None or now is None or (now.owner, now.state) != (before.owner, before.state):
-            self._heard = -1
-        if now is None or now.beat > self._heard:
+            self._reported_beat = -1
+        if now is None or now.beat > self._reported_beat:
             self._changed_s = self._clock()
         return now
 
     def note_beat(self, beat: int) -> None:
-        """Take that the owner itself told of renewal number *beat*."""
-        self._heard = max(beat, self._heard)
+        """Note that the owner itself reported renewal number *beat*."""
+        self._reported_beat = max(beat, self._reported_beat)
         self._changed_s = self._clock()
 
     def write(self, record: R) -> bool:
-        """Replace what this process knows; False if there is something else, which it then knows.
+        """Replace the record that this process knows; return False if the store holds another one.
 
-        A write whose answer was lost counts by what it left.
+        In that case this process knows the other record afterwards.  A write whose reply was lost succeeded
+        if the store holds its data.
 
         Raises:
             StoreError: The store fails; nothing is known.
         """
         began_s = self._clock()
         data = msgspec.json.encode(record)
-        found: bytes | None = data
+        stored: bytes | None = data
         try:
             self._store.compare_and_swap(self.name, self.known, data)
         except Conflict:
-            found = read_record(self._store, self.name)
-        self.note(found)
-        if found != data:
+            stored = read_record(self._store, self.name)
+        self.note(stored)
+        if stored != data:
             return False
         self._written_s = began_s
         return True
