@@ -256,9 +256,3 @@ def test_a_camera_that_is_none_is_a_typed_failure() -> None:
 
     assert isinstance(failure, Failure)
     assert failure.code == "invalid-camera"
-
-
-def test_a_command_without_options_fits_any_limit_of_iterations() -> None:
-    assert isinstance(
-        pnp(request_of(100), PlatformSettings.from_dict({"pnp": {"max_iterations": 50}})), Result
-    )

@@ -31,6 +31,9 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
 
+_WORKERS = 2  # worker processes without --workers: a laptop stays usable
+_MAX_WORKERS = 64  # each takes some 200 MB, so that more are a mistake
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions and their options."""
@@ -56,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     merge.add_argument("--out", required=True, metavar="MAP", help="the map that gets a new version")
     merge.add_argument(
         "--workers", type=int, metavar="N",
-        help="worker processes on this machine (batch.workers)",
+        help=f"worker processes on this machine, 1 to {_MAX_WORKERS} (default: {_WORKERS})",
     )  # fmt: skip
     merge.add_argument(
         "--candidates", type=int, default=8, metavar="N", help="other keyframes tried for each"
@@ -93,8 +96,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         chosen = chosen.replace(data={"store": f"dir:{os.path.abspath(path)}"})
     if args.action == "clean":
         return _clean(open_data_store(chosen))
-    if args.workers is not None:
-        chosen = chosen.replace(batch={"workers": args.workers})
     require("batch run")
     return _merge(args, chosen)
 
@@ -110,9 +111,12 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(
             "--workers and --scheduler exclude each other", hint="the scheduler has workers of its own"
         )
-    cluster: Cluster = (
-        LocalCluster(settings.batch.workers) if args.scheduler is None else RemoteCluster(args.scheduler)
-    )
+    workers = _WORKERS if args.workers is None else args.workers
+    if not 1 <= workers <= _MAX_WORKERS:
+        raise UsageError(
+            f"--workers {workers} is not within 1..{_MAX_WORKERS}", hint="choose one for each free core"
+        )
+    cluster: Cluster = LocalCluster(workers) if args.scheduler is None else RemoteCluster(args.scheduler)
     store = open_data_store(settings)
 
     def record(action: str, name: str, version: MapRecord) -> None:

@@ -15,6 +15,7 @@ __all__ = [
     "FAST_SAMPLES",
     "IDLE_CPU_PERCENT",
     "MOVES_PER_S",
+    "MOVE_WITHIN_MS",
     "UNDERUSED_CPU_PERCENT",
     "check_elasticity",
     "instance_types",
@@ -22,6 +23,8 @@ __all__ = [
 
 MOVES_PER_S = 20.0
 """Robots that a crowded server asks to move each second, so that the others accept them without a queue."""
+MOVE_WITHIN_MS = 5000.0
+"""Time that a robot gets to move to another server: reconnecting takes less than one on a bad network."""
 FAST_PERIOD_S = 10
 """One sample of the fast profile: the shortest period of a high-resolution alarm."""
 FAST_SAMPLES = 3

@@ -75,16 +75,13 @@ class ServingSettings:
     allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
     slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
-    compute_processes: int = setting(1, doc="processes of each worker that compute map services; they are killed at the deadline", low=1, high=64)
     max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; the process of one that needs more is ended", low=67108864)
     max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
     max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 turns long services off", low=0, high=64)
-    max_waiting_jobs: int = setting(8, doc="further jobs in each worker, which wait or run on another server; more are refused", low=0, high=1000)
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
     job_lease_s: float = setting(5.0, unit="s", doc="after this time without a renewal, a job begins anew on the server where its robot asks", low=0.1)
     max_job_s: float = setting(3600.0, unit="s", doc="a job that runs longer is ended; waiting has no limit", low=1)
     drain_wait_s: float = setting(1.0, unit="s", doc="a draining server reports not ready for this long before it moves its robots", low=0)
-    drain_within_ms: float = setting(5000.0, unit="ms", doc="time that robots get to move to another server", low=100)
     log_level: str = setting("info", doc="least level of the lines that are logged", choices=("debug", "info", "warning", "error"))
 
 
@@ -109,7 +106,6 @@ class PnpSettings:
     """The perspective-n-point service."""
 
     engine: str = setting("native", doc="solver of a command that chooses none; opencv is the paper's, for comparisons", choices=("native", "opencv"))
-    max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,9 +205,8 @@ class RecordingSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchSettings:
-    """Merges that are computed in parts, by several processes or machines: rse-pf batch."""
+    """Merges that are computed in parts: rse-pf batch."""
 
-    workers: int = setting(2, unit="processes", doc="processes on this machine that compute parts", low=1, high=64)
     pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part; what a killed worker loses", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
 
 

@@ -109,8 +109,9 @@ class DataServer:
             describe = describer.describe
             self._closing.callback(describer.close)
         if localiser is None:
-            count = max(photo_localiser.LEAST_PROCESSES, settings.serving.compute_processes)
-            processes = RobotProcesses(photo_localiser.TARGET, settings, store, clock, count=count)
+            processes = RobotProcesses(
+                photo_localiser.TARGET, settings, store, clock, count=photo_localiser.PROCESSES
+            )
             localiser = PhotoLocaliser(processes)
         self._closing.callback(localiser.close)
         self.handlers = Handlers(

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from rse_pf.maps.format import MapVersion
     from rse_pf.services.mapping.place import MapIndex
 
-__all__ = ["LEAST_PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
+__all__ = ["PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
 
 TARGET = f"{__name__}:make_handler"
-LEAST_PROCESSES = 3  # a robot has at most one, and the last is left to a tenant that has none (`FairThreads`)
+PROCESSES = 3  # a robot has at most one, and the last is left to a tenant that has none (`FairThreads`)
 _CACHED_MAPS = 4  # maps that a process keeps in memory
 _MAX_PHOTO_S = 3.0  # CPU time of a photo, without that of reading the map: 16 megapixels take 0.7 s
 

@@ -30,6 +30,7 @@ _POINT_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm, below the noi
 _PIXEL_DECIMALS = 2  # decimals of a pixel coordinate: 0.01 px, below the noise of features
 _DEPTH_DECIMALS = 3  # decimals of a depth in metres: 1 mm, as depth cameras write
 _WEAK_LIMITS = WeakLimits()  # limits beyond which a pose of the fast path is weak: those of `solve_pnp`
+MAX_ITERATIONS = 1000  # most RANSAC iterations of a command, which is the default of a command, too
 MAX_CORRESPONDENCES = 5000  # most correspondences of a command: more are refused, as they improve no pose
 
 
@@ -151,15 +152,19 @@ def make_request(
     )
 
 
-def register(registry: Registry, settings: PnpSettings) -> None:
-    """Add the service ``pnp`` to *registry*, with the iteration limit and the default engine of *settings*.
+def register(registry: Registry, settings: PnpSettings, *, max_iterations: int = MAX_ITERATIONS) -> None:
+    """Add the service ``pnp`` to *registry*.
+
+    Args:
+        registry: The services of a server.
+        settings: With the engine of commands that name none.
+        max_iterations: RANSAC iterations that a command may ask for.
 
     Raises:
         MissingExtra: The native core, which every engine needs, is not installed.
     """
     solver = native_solver()
-    defaults = PnpOptions(max_iterations=settings.max_iterations)
-    unset_iterations = PnpOptions().max_iterations
+    defaults = PnpOptions()
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -167,14 +172,9 @@ def register(registry: Registry, settings: PnpSettings) -> None:
         points_world, pixels = request.points_world, request.pixels
         _check_sizes(points_world, pixels)
         options = request.options or defaults
-        if options is not defaults and options.max_iterations == unset_iterations:
-            # A request without max_iterations decodes to the default value, as does one that states this
-            # value.  The limit of the server replaces it in both cases.
-            options = msgspec.structs.replace(options, max_iterations=defaults.max_iterations)
-        if options.max_iterations > settings.max_iterations:
+        if options.max_iterations > max_iterations:
             raise LimitExceeded(
-                f"{options.max_iterations} iterations are above {settings.max_iterations}",
-                hint="ask for fewer",
+                f"{options.max_iterations} iterations are above {max_iterations}", hint="ask for fewer"
             )
         engine = options.engine or settings.engine
         depths_m = None if request.depths_m is msgspec.UNSET else request.depths_m

@@ -40,9 +40,7 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
     store = DirectoryStore(tmp_path)
     for name, version in zip("ab", versions, strict=True):
         store.put(name, encode_map(version))
-    settings = PlatformSettings().replace(
-        data={"store": f"dir:{tmp_path}"}, batch={"pairs_per_part": 10, "workers": 2}
-    )
+    settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"}, batch={"pairs_per_part": 10})
     events, killed = [], []
     cluster = LocalCluster(2)
     engine = DaskEngine(store, settings, cluster, on_event=events.append)

@@ -283,7 +283,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("batch run merge hall attic --out one --store dir:store", FAILED, "there is no map 'attic'", "rse-pf map list"),
     WrongInput("batch run merge hall --out one --store dir:store --workers 2 --scheduler x:1", USAGE, "exclude each other", "has workers of its own"),
     WrongInput("batch run merge hall --out one --store dir:store --scheduler mars", USAGE, "is no address", "tcp://HOST:PORT"),
-    WrongInput("batch run merge hall --out one --store dir:store --workers 0", USAGE, "batch.workers = 0 is below 1", "raise --workers"),
+    WrongInput("batch run merge hall --out one --store dir:store --workers 0", USAGE, "--workers 0 is not within 1..64", "choose one for each free core"),
     WrongInput("batch clean --store dir:missing", USAGE, "there is no folder missing", "name the store"),
     WrongInput("map localise hall rec-empty --every 0 --store dir:store", USAGE, "--every 0 is below 1", "every frame"),
     WrongInput("map from-bag none.mcap", USAGE, "there is no bag none.mcap", ".db3 or .mcap"),

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.config import PlatformSettings, PnpSettings
+from rse_pf.config import PlatformSettings
 from rse_pf.geometry import Array, exp_se3, transform
 from rse_pf.pnp import DepthNoise, PnpOptions, refine_with_depth, solve_pnp
 from rse_pf.pnp.problems import KINECT
@@ -158,8 +158,8 @@ def test_no_finite_numbers_make_the_service_fail() -> None:
         }, found  # fmt: skip
 
 
-def test_a_servers_lower_limit_of_iterations_holds_where_a_robot_names_none() -> None:
-    registry = builtin_services(PlatformSettings(pnp=PnpSettings(max_iterations=100)))
+def test_more_iterations_than_a_server_allows_are_refused() -> None:
+    registry = builtin_services(PlatformSettings())
     points, pixels, _ = _views()
 
     def answer(options: PnpOptions) -> Result | Failure:
@@ -167,6 +167,6 @@ def test_a_servers_lower_limit_of_iterations_holds_where_a_robot_names_none() ->
         return dispatch(registry, Command(id=1, service="pnp", payload=request), lambda: 0.0)
 
     assert isinstance(answer(PnpOptions(inlier_px=4.0)), Result)
-    refused = answer(PnpOptions(max_iterations=101))
+    refused = answer(PnpOptions(max_iterations=1001))
     assert isinstance(refused, Failure)
-    assert "101 iterations are above 100" in refused.message
+    assert "1001 iterations are above 1000" in refused.message

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.elasticity import MOVE_WITHIN_MS
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.monitor import Observed, ServerPhase
@@ -317,7 +318,7 @@ class Fleet:
 
     async def finish_drain(self, member: Member, began_s: float) -> dict[str, Any]:
         """Wait until the balancer has dropped it, let it move its robots, and wait until it has left."""
-        serving, session = self.settings.serving, self.settings.session
+        session = self.settings.session
         notice_s = time_to_notice_s(self.settings.health, local=True)
         if await self._load_balancer.wait_gone(member.name, STOP_TIMEOUT_S):
             self._emit("server-out", server=member.name)
@@ -326,7 +327,7 @@ class Fleet:
         if server is not None:
             reply = await self.control(server).ask_once("/drain?wait=0", timeout_s=_ASK_S, method="POST")
         accepted = reply is not None and reply.status == 202
-        drain_s = serving.drain_within_ms / 1e3 + session.answer_timeout_s + STOP_TIMEOUT_S
+        drain_s = MOVE_WITHIN_MS / 1e3 + session.answer_timeout_s + STOP_TIMEOUT_S
         clean = True
         try:
             await asyncio.wait_for(member.over.wait(), drain_s if accepted else notice_s)

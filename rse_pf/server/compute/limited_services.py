@@ -37,7 +37,6 @@ def limited_processes(services: str, settings: PlatformSettings) -> LimitedProce
             max_reply_bytes=settings.session.max_inflated_bytes,
         ),
         configuration=configuration_of(services, settings),
-        count=serving.compute_processes,
     )
 
 

@@ -137,13 +137,12 @@ class ThreadQueue(CommandQueue):
 
 
 class LimitedQueue(ThreadQueue):
-    """Commands of limited services; each thread waits for one process with limits."""
+    """Commands of limited services; a thread waits for the process with limits."""
 
     def __init__(self, context: WorkerContext, answers: Answers, limited: LimitedServices) -> None:
         """Compute nothing yet; *limited* computes the commands in its processes."""
         services = [service for service in answers.registry if service.limited]
-        threads = context.settings.serving.compute_processes
-        super().__init__(context, answers, services, threads=threads)
+        super().__init__(context, answers, services, threads=1)  # a worker has one process with limits
         self._limited = limited
 
     def submit(self, queued: QueuedCommand, now: float) -> None:

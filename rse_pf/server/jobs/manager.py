@@ -35,6 +35,7 @@ from rse_pf.wire.arrays import extension_hook
 
 __all__ = ["JobManager"]
 
+MAX_WAITING_JOBS = 8  # jobs of a worker that may wait: with more, a robot waits for minutes
 _PROGRESS_INTERVAL_S = 0.5  # shortest time between two progress messages for one command
 _BUSY_RETRY_MS = 5000.0  # pause of a robot whose job is refused: jobs take seconds to minutes
 _CLOSE_TIMEOUT_S = 1.0  # for the records of jobs that are given up when the worker exits
@@ -191,7 +192,7 @@ class JobManager(CommandQueue):
         (`largest_holder`).
         """
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
-        if len(here) < self._serving.max_running_jobs + self._serving.max_waiting_jobs:
+        if len(here) < self._serving.max_running_jobs + MAX_WAITING_JOBS:
             return True
         newest = {entry.request.robot: entry for entry in here if entry.what == WAITING}
         held = Counter(entry.request.robot for entry in here)

@@ -24,7 +24,7 @@ from rse_pf.auth.control_token import carries_token
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.config import PlatformSettings
-from rse_pf.config.elasticity import MOVES_PER_S
+from rse_pf.config.elasticity import MOVE_WITHIN_MS, MOVES_PER_S
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.http.control_port import (
     ControlReply,
@@ -311,7 +311,7 @@ class _Supervisor:
     async def _succeed(self, heir: WorkerProcess) -> None:
         await heir.connect(on_lost=self._on_lost, on_robot=self._on_robot)
         if self._state == "draining":
-            heir.order(DrainOrder(self._settings.serving.drain_within_ms))
+            heir.order(DrainOrder(MOVE_WITHIN_MS))
         elif self._state == "leaving":
             heir.order(LeaveOrder(0.0))
 
@@ -333,11 +333,10 @@ class _Supervisor:
         self._log.info("drain", wait_s=wait_s)
         self._records.note("server.drain", wait_s=wait_s)
         await asyncio.sleep(wait_s)
-        within_ms = self._settings.serving.drain_within_ms
         for worker in self._workers:
-            worker.order(DrainOrder(within_ms))
+            worker.order(DrainOrder(MOVE_WITHIN_MS))
         with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._wait_empty(), within_ms / 1e3)
+            await asyncio.wait_for(self._wait_empty(), MOVE_WITHIN_MS / 1e3)
         await self._leave(self._settings.session.answer_timeout_s)
 
     async def _wait_empty(self) -> None:
@@ -559,7 +558,7 @@ class _Supervisor:
         self._moving_until = time.monotonic() + last_s
         for worker, delays_s in zip(self._workers, delays, strict=True):
             if delays_s:
-                worker.order(MigrateOrder(delays_s, self._settings.serving.drain_within_ms))
+                worker.order(MigrateOrder(delays_s, MOVE_WITHIN_MS))
         self._log.info("migration", robots=asked, spread_s=round(last_s, 3))
         self._records.note("server.move", robots=asked, spread_s=round(last_s, 3))
         return asked, round(last_s, 3)

@@ -12,6 +12,7 @@ from rse_pf.audit.log import SYNC_S
 from rse_pf.aws.fleet.task import Phase
 from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
+from rse_pf.config.elasticity import MOVE_WITHIN_MS
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, DRAIN_S, time_to_notice_s
 from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
@@ -85,7 +86,7 @@ def test_a_slow_load_balancer_leaves_two_thirds_of_the_hooks_time_to_the_robots(
 def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
     longest_s = (
         time_to_notice_s(SETTINGS.health, local=False)
-        + SETTINGS.serving.drain_within_ms / 1e3
+        + MOVE_WITHIN_MS / 1e3
         + SETTINGS.session.answer_timeout_s
     )
 

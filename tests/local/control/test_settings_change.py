@@ -31,7 +31,7 @@ def test_options_of_the_start_stay_unless_the_file_sets_another_value() -> None:
     [
         ({}, "changes no setting"),
         ({"serving": {"port": 9000}, "data": {"port": 9001}}, "changes no setting"),
-        ({"cloud": {"region": "eu-central-1"}, "batch": {"workers": 3}}, "changes no setting"),
+        ({"cloud": {"region": "eu-central-1"}, "batch": {"pairs_per_part": 30}}, "changes no setting"),
         ({"local": {"port": 9000}}, "local.port needs a restart"),
         (
             {"health": {"unhealthy_checks": 3}, "session": {"max_in_flight": 4}},

@@ -113,17 +113,6 @@ def test_other_options_are_tried_and_said(tmp_path: Path) -> None:
         resolver.again(command, Overrides(engine="magic"))
 
 
-def test_the_limits_of_the_server_that_recorded_hold_again(tmp_path: Path) -> None:
-    small = SETTINGS.replace(pnp={"max_iterations": 40})
-    made = Made(tmp_path / "a", settings=small)
-    made.send(make_problem(seed=1, n=60))
-    made.send(make_problem(seed=2, n=40, outlier_ratio=0.7))
-
-    seen = run.overview(made.close(), SETTINGS, solve=True)
-
-    assert (seen.equal, seen.different) == (2, 0)
-
-
 def test_what_went_wrong_is_listed_worst_first(tmp_path: Path) -> None:
     made = Made(tmp_path / "a")
     problem = make_problem(seed=3, n=60, outlier_ratio=0.0)

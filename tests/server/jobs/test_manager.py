@@ -169,8 +169,11 @@ def test_a_process_that_cannot_be_started_does_not_count_as_a_crash_of_the_serve
     assert [code(bench.answers[identity]) for identity in range(6)] == ["error"] * 5 + ["ok"]
 
 
-def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(make):
-    bench, busy_robot, other_robot = make(max_waiting_jobs=3), robot("greedy"), robot("modest")
+def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(
+    make, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("rse_pf.server.jobs.manager.MAX_WAITING_JOBS", 3)
+    bench, busy_robot, other_robot = make(), robot("greedy"), robot("modest")
     ask(bench, busy_robot, 0, value=0)
     bench.process()
     bench.run_until(lambda: bench.loop.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))

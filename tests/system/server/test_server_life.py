@@ -42,7 +42,7 @@ async def test_a_drain_moves_the_robots_and_loses_nothing(start_server):
 
 
 async def test_robots_that_do_not_move_get_their_answers_before_the_socket_closes(start_server):
-    server = start_server(serving={"drain_within_ms": 100.0})
+    server = start_server()
 
     async with server.robot() as robot:
         await robot.send(Command(id=1, service="work", payload={"rest_s": 0.8}))

@@ -10,6 +10,7 @@ import json
 import pytest
 
 from client_sdk import connect
+from rse_pf.config.elasticity import MOVE_WITHIN_MS
 from rse_pf.wire import Move
 
 pytestmark = pytest.mark.system
@@ -111,7 +112,7 @@ async def test_the_request_to_move_gives_the_reason_and_the_time(start_server):
 
     assert isinstance(asked, Move)
     assert asked.reason == "rebalance"
-    assert asked.within_ms == server.settings.serving.drain_within_ms
+    assert asked.within_ms == MOVE_WITHIN_MS
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from typing import Any
 from rse_pf.aws.clients import call_api
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of, read_page
 from rse_pf.aws.fleet.task import AgentContext, Phase, Task
+from rse_pf.config.elasticity import MOVE_WITHIN_MS
 from rse_pf.errors import Disconnected
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.profile import cadence_of
@@ -84,8 +85,7 @@ class _Rebalancing:
         failures = 0 if self._asked is None else self._asked.failures
         stayed = self._asked is not None and robots >= self._asked.robots
         self._asked = _Asked(order=order, robots=robots, failures=failures + 1 if stayed else 0)
-        within_s = context.settings.serving.drain_within_ms / 1e3
-        pause_s = pause_after_s(order, within_s=within_s, failures=self._asked.failures)
+        pause_s = pause_after_s(order, within_s=MOVE_WITHIN_MS / 1e3, failures=self._asked.failures)
         self._quiet_until_s = context.clock() + pause_s
         newest = totals[0]
         context.log(

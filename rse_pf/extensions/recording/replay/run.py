@@ -227,7 +227,8 @@ def _pnp_settings(text: str) -> dict[str, Any]:
     """Return the settings of the solver that *text* says, the defaults where it says none."""
     defaults = dataclasses.asdict(PnpSettings())
     try:
-        given = msgspec.json.decode(text, type=dict[str, Any])
+        recorded = msgspec.json.decode(text, type=dict[str, Any])
+        given = {name: value for name, value in recorded.items() if name in defaults}
         PlatformSettings().replace(pnp=given)
     except (msgspec.DecodeError, RsePfError, TypeError, ValueError):
         return defaults

@@ -9,11 +9,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 
-from rse_pf.config import PlatformSettings
+from rse_pf.config import PlatformSettings, PnpSettings
 from rse_pf.errors import (
     BadMessage,
     BadRequest,
@@ -27,6 +26,7 @@ from rse_pf.limits.budget import Budget, inflate_within
 from rse_pf.pnp import PnpOptions, available_engines
 from rse_pf.pnp.engines import engine_for
 from rse_pf.service import Registry, dispatch, request_of
+from rse_pf.services import pnp
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import Codec, Command, Failure, Result, as_type, make_codec
@@ -35,7 +35,7 @@ __all__ = ["TIMES_AND_PLACES", "Again", "Overrides", "Resolver", "pnp_reply", "s
 
 TIMES_AND_PLACES = ("server", "queue_ms", "compute_ms", "received_s", "sent_s", "trace")
 """Fields of answers that say when, where and for whom, which differ whenever a command is solved again."""
-_MOST_ITERATIONS = 100_000
+_MAX_TRIED_ITERATIONS = 100_000  # as many as options can ask for; a server allows fewer
 _POSES_SERVICE = "pnp"
 
 
@@ -89,7 +89,7 @@ class Resolver:
         self._settings = settings or PlatformSettings()
         self._clock = clock
         self._budget = Budget.of_messages(self._settings.session)
-        self._registries: dict[tuple[str, bool], Registry] = {}
+        self._registries: dict[str, Registry] = {}
         self._codecs: dict[str, Codec] = {}
         self._engines = available_engines()
 
@@ -129,7 +129,7 @@ class Resolver:
         if overrides.changes and command.service == _POSES_SERVICE:
             answer = self._try(command, overrides, engine)
         else:
-            registry = self._registry(engine if engine in self._engines else self._engines[0], free=False)
+            registry = self._registry(engine if engine in self._engines else self._engines[0])
             answer = dispatch(registry, command, self._clock)
         if reply is None:
             return Again(answer=answer, difference="it was never answered")
@@ -149,16 +149,12 @@ class Resolver:
         command = self.decoded(recorded)
         if command.service != _POSES_SERVICE:
             return None
-        request: PnpRequest = request_of(
-            command.payload, self._registry(self._engines[0], free=False).get("pnp")
-        )
+        request: PnpRequest = request_of(command.payload, self._registry(self._engines[0]).get("pnp"))
         return request
 
     def _why_not(self, command: Command, reply: Result | Failure | None) -> str:
         """Return why *command* cannot be solved again, "" if it can."""
-        service = next(
-            (s for s in self._registry(self._engines[0], free=False) if s.name == command.service), None
-        )
+        service = next((s for s in self._registry(self._engines[0]) if s.name == command.service), None)
         if service is None:
             return "its service is installed on the server"
         if service.kind != "stateless":
@@ -178,7 +174,9 @@ class Resolver:
         return self.default_engine
 
     def _try(self, command: Command, overrides: Overrides, engine: str) -> Result | Failure:
-        registry = self._registry(engine if engine in self._engines else self._engines[0], free=True)
+        engine = engine if engine in self._engines else self._engines[0]
+        registry = Registry()
+        pnp.register(registry, PnpSettings(engine=engine), max_iterations=_MAX_TRIED_ITERATIONS)
         try:
             request = request_of(command.payload, registry.get(_POSES_SERVICE))
             options = overrides.of(request.options)
@@ -190,15 +188,11 @@ class Resolver:
             self._clock,
         )
 
-    def _registry(self, engine: str, *, free: bool) -> Registry:
-        """Return the services with *engine*; *free* ones allow any number of iterations."""
-        key = engine, free
-        if key not in self._registries:
-            pnp: dict[str, Any] = {"engine": engine}
-            if free:
-                pnp["max_iterations"] = _MOST_ITERATIONS
-            self._registries[key] = builtin_services(self._settings.replace(pnp=pnp))
-        return self._registries[key]
+    def _registry(self, engine: str) -> Registry:
+        """Return the services of a server with *engine*."""
+        if engine not in self._registries:
+            self._registries[engine] = builtin_services(self._settings.replace(pnp={"engine": engine}))
+        return self._registries[engine]
 
     def _codec(self, name: str) -> Codec:
         if name not in self._codecs:
