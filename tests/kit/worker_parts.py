@@ -23,8 +23,8 @@ from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.log import JsonLog
 from rse_pf.server.object_refs import ObjectRefs
-from rse_pf.server.ports import Clocks, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue
+from rse_pf.server.worker_context import Clocks, WorkerContext
 from rse_pf.service import Registry
 from rse_pf.services import echo
 from rse_pf.storage.object_store import MemoryStore

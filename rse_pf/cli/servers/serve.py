@@ -23,7 +23,7 @@ from rse_pf.errors import UsageError
 from rse_pf.extensions.recording.writer import with_recordings
 
 if TYPE_CHECKING:
-    from rse_pf.server.ports import ServerRecorder
+    from rse_pf.server.worker_context import ServerRecorder
 
 __all__ = ["add_arguments", "run"]
 

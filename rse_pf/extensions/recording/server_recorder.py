@@ -24,7 +24,7 @@ from rse_pf.extensions.recording.recorder_process import RecorderPlan, start_rec
 from rse_pf.extensions.recording.redact import KEY_BYTES
 from rse_pf.extensions.recording.tap import RecordingTap, hand_pipe
 from rse_pf.processes.start import Child
-from rse_pf.server.ports import Log, MessageTap, NullMessageTap
+from rse_pf.server.worker_context import Log, MessageTap, NullMessageTap
 from rse_pf.version import installed_version
 from rse_pf.wire import PROTOCOL_VERSION
 
@@ -36,7 +36,7 @@ _MOST_RESTARTS, _WITHIN_S = 5, 600.0
 
 
 class FileServerRecorder:
-    """Record one server in files, inside of ``with``; a `rse_pf.server.ports.ServerRecorder`.
+    """Record one server in files, inside of ``with``; a `rse_pf.server.worker_context.ServerRecorder`.
 
     A recorder process that exits although there are workers is started again, up to five times in ten
     minutes.  Workers send it the ends of their pipes by the socket ``to_recorder``.

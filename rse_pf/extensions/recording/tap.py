@@ -78,7 +78,7 @@ def hand_pipe(to_recorder: int) -> int | None:
 
 
 class RecordingTap:
-    """Pass the messages of a worker's connections to the recorder; a `rse_pf.server.ports.MessageTap`."""
+    """Pass the messages of connections to the recorder; a `rse_pf.server.worker_context.MessageTap`."""
 
     __slots__ = (
         "_call_later",

@@ -14,8 +14,8 @@ from rse_pf.limits.crash_record import CrashRecord
 from rse_pf.processes.limited import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.processes.linux import cpu_seconds
 from rse_pf.server.compute.process import TARGET, configuration_of, decode_reply, encode_request
-from rse_pf.server.ports import WorkerContext
 from rse_pf.server.scheduling.command_queue import QueuedCommand
+from rse_pf.server.worker_context import WorkerContext
 from rse_pf.service import failure_of
 from rse_pf.wire import Command, Failure, Result
 

@@ -15,8 +15,8 @@ from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError, Unknow
 from rse_pf.server.gateway.admission import UnreadRefusal
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.object_refs import ObjectRefs, takes_objects
-from rse_pf.server.ports import WorkerContext
 from rse_pf.server.scheduling.command_queue import QueuedCommand, RefusedCommand
+from rse_pf.server.worker_context import WorkerContext
 from rse_pf.service import Registry, dispatch, failure_of, unknown_service
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal

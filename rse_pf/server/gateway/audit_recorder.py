@@ -18,7 +18,7 @@ from rse_pf.audit.log import SYNC_S, AuditLog
 from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.tokens import Claims, KeySet
 from rse_pf.server.gateway.handshake import Accepted, Rejected
-from rse_pf.server.ports import Clocks
+from rse_pf.server.worker_context import Clocks
 
 __all__ = ["AuditRecorder", "ServerAudit"]
 

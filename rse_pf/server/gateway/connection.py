@@ -14,8 +14,8 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.errors import RsePfError
 from rse_pf.server.gateway.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.server.gateway.handshake import Accepted
-from rse_pf.server.ports import NullMessageTap, Wire, WorkerContext
 from rse_pf.server.scheduling.overload import MAX_EARLY_COMMANDS
+from rse_pf.server.worker_context import NullMessageTap, Wire, WorkerContext
 from rse_pf.wire import Progress
 from rse_pf.wire.server_session import ServerSession
 

@@ -24,9 +24,9 @@ from rse_pf.server.gateway.rate_limits import CUT_OFF
 from rse_pf.server.gateway.service_queues import StatelessQueue
 from rse_pf.server.gateway.token_watch import TokenWatch
 from rse_pf.server.live_map.router import LiveMapRouter
-from rse_pf.server.ports import Wire, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.server.scheduling.decoder_thread import DecoderThread
+from rse_pf.server.worker_context import Wire, WorkerContext
 from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import CODECS, Codec, Command
 from rse_pf.wire.envelope import peek

@@ -15,7 +15,6 @@ from rse_pf.server.compute.limited_services import LimitedServices
 from rse_pf.server.gateway.admission import is_in_scope
 from rse_pf.server.gateway.answers import Answers, EncodedAnswer
 from rse_pf.server.metrics import LongestRecently
-from rse_pf.server.ports import WorkerContext
 from rse_pf.server.scheduling.command_queue import (
     CommandQueue,
     QueueBacklog,
@@ -25,6 +24,7 @@ from rse_pf.server.scheduling.command_queue import (
 )
 from rse_pf.server.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.server.scheduling.scheduler import INLINE_BYTES, Scheduler
+from rse_pf.server.worker_context import WorkerContext
 from rse_pf.service import Service
 
 __all__ = ["LimitedQueue", "StatelessQueue", "ThreadQueue"]

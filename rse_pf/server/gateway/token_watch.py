@@ -13,7 +13,7 @@ from rse_pf.auth.tokens import Claims, KeySet, claims_problem, renewed_claims
 from rse_pf.server.gateway.audit_recorder import AuditRecorder
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.handshake import HandshakePolicy
-from rse_pf.server.ports import WorkerContext
+from rse_pf.server.worker_context import WorkerContext
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 __all__ = ["TokenWatch"]

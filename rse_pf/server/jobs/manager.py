@@ -27,8 +27,8 @@ from rse_pf.server.jobs.lease import job_key
 from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.record_gc import RECORD_TTL_S, RecordCollector
 from rse_pf.server.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
-from rse_pf.server.ports import Log
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
+from rse_pf.server.worker_context import Log
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Progress, Result
 from rse_pf.wire.arrays import extension_hook

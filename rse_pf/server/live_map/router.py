@@ -29,8 +29,8 @@ from rse_pf.errors import (
 from rse_pf.identity import RobotId
 from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.subscriptions import Subscriptions
-from rse_pf.server.ports import Subscriber, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
+from rse_pf.server.worker_context import Subscriber, WorkerContext
 from rse_pf.service import failure_of
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_odometry_range, decode_keyframe
 from rse_pf.wire import Failure, Result, as_type

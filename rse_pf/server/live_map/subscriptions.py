@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.errors import BadMessage, RsePfError
-from rse_pf.server.ports import Log, Subscriber
+from rse_pf.server.worker_context import Log, Subscriber
 from rse_pf.wire import Update
 from rse_pf.wire.live_map import live_topic
 from rse_pf.wire.preencoded import encode_payload

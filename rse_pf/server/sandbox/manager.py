@@ -19,7 +19,6 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, NotFound, RsePfError
 from rse_pf.identity import RobotId, state_name
 from rse_pf.processes.ipc import encode_message
-from rse_pf.server.ports import Log
 from rse_pf.server.sandbox.channel import IpcChannel, is_ready, outcome_of
 from rse_pf.server.sandbox.circuit_breaker import Block
 from rse_pf.server.sandbox.policy import (
@@ -38,6 +37,7 @@ from rse_pf.server.sandbox.policy import (
 )
 from rse_pf.server.sandbox.zygote_client import ZygoteClient
 from rse_pf.server.scheduling.command_queue import QueuedCommand
+from rse_pf.server.worker_context import Log
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.storage.object_store import ObjectStore

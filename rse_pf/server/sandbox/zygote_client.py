@@ -17,7 +17,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.processes.fork_server import read_packet, send_order, start_fork_server
 from rse_pf.processes.start import ChildPlan
-from rse_pf.server.ports import Log
+from rse_pf.server.worker_context import Log
 from rse_pf.services.custom.installed import InstalledService
 
 __all__ = ["ZygoteClient"]

@@ -13,8 +13,8 @@ import threading
 from collections.abc import Callable
 
 from rse_pf.errors import BadMessage, ProtocolError
-from rse_pf.server.ports import CrashMarks
 from rse_pf.server.scheduling.scheduler import INLINE_BYTES
+from rse_pf.server.worker_context import CrashMarks
 from rse_pf.wire import Codec
 from rse_pf.wire.messages import FromRobot
 

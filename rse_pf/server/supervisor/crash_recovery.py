@@ -15,12 +15,12 @@ from rse_pf.auth.trust_store import TrustStore
 from rse_pf.identity import RobotId
 from rse_pf.limits.crash_record import BLOCK_S, WINDOW_S, CrashRecord
 from rse_pf.server.gateway.audit_recorder import ServerAudit
-from rse_pf.server.ports import Log
 from rse_pf.server.supervisor.crash_report import CRASH_SIGNALS, CrashReport
 from rse_pf.server.supervisor.orders import BanOrder, BeginOrder
 from rse_pf.server.supervisor.session_registry import SessionRegistry
 from rse_pf.server.supervisor.worker import WorkerPlan
 from rse_pf.server.supervisor.worker_handle import WorkerProcess
+from rse_pf.server.worker_context import Log
 
 __all__ = ["CrashRecovery", "restart_delay_s", "spare_plans"]
 

@@ -40,7 +40,6 @@ from rse_pf.server.gateway.migration import plan
 from rse_pf.server.jobs.slots import make_slot_file
 from rse_pf.server.log import JsonLog
 from rse_pf.server.metrics import merge, merge_isolation, render, tenant_cpu_s
-from rse_pf.server.ports import NullServerRecorder, ServerRecorder
 from rse_pf.server.supervisor.accepting import RobotAcceptor
 from rse_pf.server.supervisor.crash_recovery import CrashRecovery, spare_plans
 from rse_pf.server.supervisor.listener import bound_socket, check_authentication, open_control
@@ -57,6 +56,7 @@ from rse_pf.server.supervisor.session_registry import SessionRegistry
 from rse_pf.server.supervisor.trust_poller import poll_trust
 from rse_pf.server.supervisor.worker import WorkerPlan
 from rse_pf.server.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerProcess, fork_workers
+from rse_pf.server.worker_context import NullServerRecorder, ServerRecorder
 from rse_pf.storage.files import replace_json
 from rse_pf.version import installed_version
 

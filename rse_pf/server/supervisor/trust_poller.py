@@ -9,9 +9,9 @@ import asyncio
 from collections.abc import Sequence
 
 from rse_pf.auth.trust_store import REFRESH_S, TrustStore
-from rse_pf.server.ports import Log
 from rse_pf.server.supervisor.orders import TrustOrder
 from rse_pf.server.supervisor.worker_handle import WorkerProcess
+from rse_pf.server.worker_context import Log
 
 __all__ = ["poll_trust", "update_workers"]
 

@@ -49,7 +49,6 @@ from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.server.log import JsonLog
 from rse_pf.server.object_refs import ObjectRefs
-from rse_pf.server.ports import Clocks, NullServerRecorder, ServerRecorder, WorkerContext
 from rse_pf.server.robot_store import is_shared
 from rse_pf.server.sandbox.circuit_breaker import Block
 from rse_pf.server.sandbox.manager import SandboxHost, SandboxManager
@@ -73,6 +72,7 @@ from rse_pf.server.supervisor.orders import (
     decode_order,
 )
 from rse_pf.server.supervisor.robot_reports import MAX_ROBOT_ROWS, RobotEvents, robot_rows
+from rse_pf.server.worker_context import Clocks, NullServerRecorder, ServerRecorder, WorkerContext
 from rse_pf.services.custom.installed import InstalledService, installed_services, packaged_services
 from rse_pf.services.loading import load_services
 from rse_pf.storage.object_store import ObjectStore

@@ -14,7 +14,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.identity import RobotId
 from rse_pf.server.gateway.audit_recorder import AuditRecorder, ServerAudit
 from rse_pf.server.gateway.handshake import Accepted, Rejected
-from rse_pf.server.ports import Clocks
+from rse_pf.server.worker_context import Clocks
 from tests.kit.fakes import FakeLoop
 
 ROBOT = RobotId("default", "robot-1")

@@ -10,7 +10,7 @@ import pytest
 from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.live_map.router import LiveMapRouter
-from rse_pf.server.ports import WorkerContext
+from rse_pf.server.worker_context import WorkerContext
 from rse_pf.wire import Command, Failure, Hello, Subscribe, Unsubscribe, Update
 from rse_pf.wire.server_session import MAX_SUBSCRIPTIONS
 from tests.kit.fake_map_client import FakeLiveMapClient

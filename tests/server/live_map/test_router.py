@@ -21,8 +21,8 @@ from rse_pf.errors import (
 from rse_pf.geometry import Camera
 from rse_pf.identity import RobotId
 from rse_pf.server.live_map.router import LiveMapRouter
-from rse_pf.server.ports import Clocks, WorkerContext
 from rse_pf.server.scheduling.command_queue import QueuedCommand
+from rse_pf.server.worker_context import Clocks, WorkerContext
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, Failure, Result, Update
 from rse_pf.wire.live_map import KeyframeRequest

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import LimitExceeded
-from rse_pf.server.ports import NoCrashMarks
 from rse_pf.server.scheduling.decoder_thread import DecoderThread
+from rse_pf.server.worker_context import NoCrashMarks
 from tests.kit.fakes import FakeLoop
 
 DEADLINE_S = 10.0

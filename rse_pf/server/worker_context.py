@@ -1,4 +1,4 @@
-"""What the parts of a worker need of the outside: a socket, an event loop, a log, clocks and settings."""
+"""Declare what the parts of a worker share: clocks, log, settings, and interfaces of socket and recorder."""
 
 from __future__ import annotations
 
