@@ -16,6 +16,7 @@ from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
 from rse_pf.storage.quotas import Accounts
 from tests.kit.fake_data_service import Answer, Service, small_settings
+from tests.kit.fake_store import FakeStore, fail_with
 
 ROBOT = RobotId("default", "robot-1")
 
@@ -142,42 +143,8 @@ def test_how_many_versions_stay_is_a_number_above_zero(service: Service, query: 
     assert len(service.ask("GET", VERSIONS).json) == 1
 
 
-def test_versions_of_a_map_that_does_not_exist_are_not_removed(service: Service) -> None:
-    assert service.ask("DELETE", VERSIONS, query="keep=1").status == 404
-
-
-def test_another_tenant_removes_nothing(service: Service) -> None:
-    first = commit(service, 1, None)
-    commit(service, 2, first.json["id"])
-
-    assert service.ask("DELETE", VERSIONS, query="keep=1", tenant="rival").status == 404
-    assert len(service.ask("GET", VERSIONS).json) == 2
-
-
-def test_a_refused_commit_charges_nothing(service: Service) -> None:
-    first = commit(service, 1, None)
-    before = [info.name for info in service.store.list("charges/")]
-
-    assert commit(service, 2, None).status == 409
-    assert commit(service, 3, "0" * 64).status == 409, "it may have been removed"
-
-    assert first.status == 201
-    assert [info.name for info in service.store.list("charges/")] == before
-    (name,) = before
-    assert name == f"charges/default/robot-1/kitchen/{first.json['id']}.{first.json['record']['size']}"
-
-
-class FullAfterTheCharge(MemoryStore):
-    """Has no space for maps."""
-
-    def put(self, name: str, data: bytes) -> None:
-        if name.startswith("maps/"):
-            raise StoreFull("no space")
-        super().put(name, data)
-
-
 def test_a_commit_that_finds_the_disk_full_charges_nothing() -> None:
-    service = Service(small_settings(), FullAfterTheCharge())
+    service = Service(small_settings(), FakeStore(fail_with(StoreFull("no space"), "put", part="maps/")))
 
     assert commit(service, 1, None).status == 507
     assert [info.name for info in service.store.list()] == ["accounts/default"]
@@ -242,26 +209,6 @@ def test_counting_again_reads_only_folders_that_changed(
     write(made, store, b"second")
 
     assert len({path for path in read if "+" in path}) <= 1, "the folder of the first write"
-
-
-def test_a_write_that_fails_counts_for_nothing() -> None:
-    now, store = [0.0], MemoryStore()
-    made = ledger(store, now, max_objects=1)
-    for _ in range(3):
-        with pytest.raises(StoreFull), made.reservation(ROBOT, 10):
-            raise StoreFull("no space")
-
-    write(made, store, b"x")
-
-    with pytest.raises(QuotaExceeded):
-        write(made, store, b"y")
-
-
-def test_writes_in_progress_count() -> None:
-    made = ledger(MemoryStore(), [0.0], max_objects=2)
-
-    with made.reservation(ROBOT, 1), made.reservation(ROBOT, 1), pytest.raises(QuotaExceeded):
-        made.reservation(ROBOT, 1).__enter__()
 
 
 def test_an_object_that_is_written_while_the_robot_is_counted_counts_once() -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from rse_pf.data_server.uploads import UPLOAD_TTL_S
-from rse_pf.storage.object_store import DirectoryStore, MemoryStore, digest_of
+from rse_pf.storage.object_store import DirectoryStore, digest_of
 from tests.kit.fake_data_service import Answer, Service, small_settings
+from tests.kit.fake_store import FakeStore, do_nothing, fail_with
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)
@@ -23,18 +24,6 @@ def begin(service: Service, size: int = len(DATA)) -> Answer:
 
 def part(service: Service, start: int, end: int, data: bytes = DATA) -> Answer:
     return service.ask("PATCH", UPLOAD, data[start:end], headers={"upload-offset": str(start)})
-
-
-def test_the_last_part_completes_the_object(service: Service) -> None:
-    assert begin(service).json == {"digest": DIGEST, "size": 10_000, "offset": 0, "part_bytes": 4096}
-
-    assert [part(service, *ends).status for ends in [(0, 4096), (4096, 8192)]] == [200, 200]
-    assert service.ask("GET", OBJECT).status == 404
-    last = part(service, 8192, 10_000)
-
-    assert (last.status, last.headers["upload-offset"]) == (201, "10000")
-    assert service.ask("GET", OBJECT).body == DATA
-    assert [info.name for info in service.store.list("uploads/")] == []
 
 
 def test_another_server_resumes_the_upload_of_a_killed_one(service: Service) -> None:
@@ -84,19 +73,6 @@ def test_wrong_bytes_never_become_an_object_and_are_removed(service: Service) ->
     assert service.ask("GET", UPLOAD).status == 404
 
 
-@pytest.mark.parametrize("size", [0, -1, 20_001])
-def test_an_impossible_size_is_refused(service: Service, size: int) -> None:
-    assert begin(service, size).status in (400, 413)
-    assert [info.name for info in service.store.list() if not info.name.startswith("accounts/")] == []
-
-
-def test_more_bytes_than_announced_are_refused(service: Service) -> None:
-    begin(service, 100)
-
-    assert part(service, 0, 101).status == 400
-    assert begin(service, 200).status == 409
-
-
 def test_parts_are_not_flushed_to_the_disk_but_the_object_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,15 +111,6 @@ def test_an_upload_resumes_after_a_part_that_a_crash_cut_short(service: Service)
     assert service.ask("GET", OBJECT).body == DATA
 
 
-def test_an_upload_of_an_existing_object_is_complete_at_once(service: Service) -> None:
-    begin(service)
-    for ends in [(0, 4096), (4096, 8192), (8192, 10_000)]:
-        part(service, *ends)
-
-    assert begin(service).json["offset"] == 10_000
-    assert part(service, 0, 4096).status == 201
-
-
 def test_a_robot_cannot_see_or_continue_the_upload_of_another(service: Service) -> None:
     begin(service)
 
@@ -166,19 +133,8 @@ def test_old_uploads_and_orphaned_parts_are_removed_and_new_uploads_are_not(serv
     assert [info.name for info in service.store.list() if not info.name.startswith("accounts/")] == []
 
 
-class SwallowsTheLast(MemoryStore):
-    """Dies while the object itself is written."""
-
-    def put(self, name: str, data: bytes) -> None:
-        if name.startswith("objects/") and not self.well:
-            raise SystemExit
-        super().put(name, data)
-
-    well = False
-
-
 def test_a_crash_while_the_object_is_written_loses_no_part() -> None:
-    store = SwallowsTheLast()
+    store = FakeStore(fail_with(SystemExit(), "put", part="objects/"))
     service = Service(small_settings(), store)
     begin(service)
     part(service, 0, 4096)
@@ -186,7 +142,7 @@ def test_a_crash_while_the_object_is_written_loses_no_part() -> None:
     with pytest.raises(SystemExit):
         part(service, 8192, 10_000)
 
-    store.well = True
+    store.before = do_nothing
     service.restart()
 
     assert begin(service).json["offset"] == 10_000

@@ -24,15 +24,16 @@ from rse_pf.storage.lease import read_record
 from rse_pf.storage.object_store import MemoryStore, ObjectStore
 from rse_pf.storage.quotas import TenantAccount
 from tests.kit.fake_map import FAKE_MAP
+from tests.kit.fake_store import FakeStore
 from tests.kit.fakes import FakeLog
 
 __all__ = [
     "MAP",
     "ROBOT",
-    "Bench",
     "FailingStore",
     "HandClock",
     "InlineThreads",
+    "MapServerSetup",
     "RunningMapServer",
     "settle",
 ]
@@ -85,30 +86,20 @@ class InlineThreads:
     match = lease = background = store
 
 
-class FailingStore(MemoryStore):
+class FailingStore(FakeStore):
     """Fails with a given probability, before a change or after it: then the change is made all the same."""
 
     def __init__(self, share: float = 0.0, seed: int = 0) -> None:
-        super().__init__()
+        super().__init__(self._fail, self._fail)
         self.share = share
         self.failures = 0
         self._random = random.Random(seed)
 
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        self._fail()
-        super().compare_and_swap(name, expected, data)
-        self._fail()
-
-    def get(self, name: str) -> bytes:
-        self._fail()
-        return super().get(name)
-
-    def put(self, name: str, data: bytes) -> None:
-        self._fail()
-        super().put(name, data)
-
-    def _fail(self) -> None:
-        if self._random.random() < self.share:
+    def _fail(self, operation: str, name: str, data: bytes) -> None:
+        if (
+            operation in ("get", "get_range", "put", "compare_and_swap")
+            and self._random.random() < self.share
+        ):
             self.failures += 1
             raise StoreError("the store fails", hint="wait")
 
@@ -116,7 +107,7 @@ class FailingStore(MemoryStore):
 class RunningMapServer:
     """A running map server with all that it sent."""
 
-    def __init__(self, bench: Bench, name: str) -> None:
+    def __init__(self, bench: MapServerSetup, name: str) -> None:
         self.sent_updates: list[dict[str, Any]] = []
         self.renewals: list[int] = []
         self.uses: list[bool] = []
@@ -169,7 +160,7 @@ class RunningMapServer:
         return [payload for payload in self.sent_updates if payload["kind"] == kind][-1]
 
 
-class Bench:
+class MapServerSetup:
     """A store and a manual clock, on which a test starts map servers one after the other."""
 
     def __init__(

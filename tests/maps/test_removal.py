@@ -6,10 +6,9 @@ import contextlib
 import itertools
 import subprocess
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull
@@ -18,48 +17,29 @@ from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import ABANDONED_S, MAX_REMOVAL_S, Marks, choose_superseded, count_freed_bytes
 from rse_pf.storage.charges import charge_name, sum_charges
-from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore
+from tests.kit.fake_store import FakeStore
 from tests.kit.sample_maps import make_map
 
 NAME, FOLDER = "kitchen", "maps/default/kitchen/"
 ROBOT = RobotId("default", "robot-1")
 
 
-class SteppedStore(MemoryStore):
+class SteppedStore(FakeStore):
     """A store that calls *act* before its operation number *at*, counted from 1 since `count_from_here`."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.steps, self._at, self._act = 0, 0, lambda: None
+        super().__init__(self._step)
+        self.count_from_here(0, lambda: None)
 
     def count_from_here(self, at: int, act: Callable[[], None]) -> None:
         self.steps, self._at, self._act = 0, at, act
 
-    def _step(self) -> None:
+    def _step(self, operation: str, name: str, data: bytes) -> None:
         self.steps += 1
         if self.steps == self._at:
             self._at = 0
             self._act()
-
-    def get(self, name: str) -> bytes:
-        self._step()
-        return super().get(name)
-
-    def put(self, name: str, data: bytes) -> None:
-        self._step()
-        super().put(name, data)
-
-    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
-        self._step()
-        return super().list(prefix, after)
-
-    def delete(self, name: str) -> None:
-        self._step()
-        super().delete(name)
-
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        self._step()
-        super().compare_and_swap(name, expected, data)
 
 
 def bytes_of(seed: int) -> bytes:
@@ -214,13 +194,11 @@ class SteppedThread:
 CURRENT = threading.local()
 
 
-class SharedStore(SteppedStore):
-    """A store in which each operation waits until its thread is permitted to do it."""
-
-    def _step(self) -> None:
-        thread = getattr(CURRENT, "thread", None)
-        if thread is not None:
-            thread.step()
+def wait_for_permission(operation: str, name: str, data: bytes) -> None:
+    """Wait until the thread that uses the store is permitted to go on."""
+    thread = getattr(CURRENT, "thread", None)
+    if thread is not None:
+        thread.step()
 
 
 ACTS = {"prune": prune, "commit": inner_commit, "rollback": inner_rollback}
@@ -232,7 +210,7 @@ def test_in_every_order_of_two_interruptions_the_head_and_every_version_stay_who
     codes = set()
     for before in itertools.count():
         for between in itertools.count():
-            store = SharedStore()
+            store = FakeStore(wait_for_permission)
             maps = MapRegistry(store)
             for seed in range(1, 4):
                 commit(maps, seed)
@@ -317,17 +295,6 @@ def test_marks_of_a_process_that_crashed_keep_nobody_from_committing_for_ever():
     assert maps.data(NAME) == bytes_of(1)
 
 
-def test_a_version_whose_parent_was_removed_is_a_conflict_for_who_still_holds_it():
-    maps = MapRegistry(MemoryStore())
-    first = commit(maps, 1)
-    for seed in (2, 3):
-        commit(maps, seed)
-    prune(maps, keep=1)
-
-    with pytest.raises(Conflict):
-        maps.commit(NAME, bytes_of(4), parent=first.id, author="r", created_s=2e9)
-
-
 @pytest.mark.system
 def test_versions_are_removed_from_a_disk_that_is_full(tmp_path: Path):
     folder = tmp_path / "disk"
@@ -352,9 +319,3 @@ def test_versions_are_removed_from_a_disk_that_is_full(tmp_path: Path):
         assert commit(maps, 9).number == 5
     finally:
         subprocess.run(["umount", str(folder)], check=True)
-
-
-def test_the_usage_of_a_record_is_what_the_store_charges():
-    data = msgspec.json.encode(record(1))
-
-    assert Usage(1, count_freed_bytes([record(1, size=5000)])) == Usage(1, 5000 + max(4096, len(data)))

@@ -16,7 +16,7 @@ from rse_pf.aws.fleet import agent
 from rse_pf.aws.fleet.agent import main
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.errors import Disconnected, StoreError
-from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_store import FakeStore, do_nothing, fail_with
 
 
 class _Port(BaseHTTPRequestHandler):
@@ -60,21 +60,6 @@ def test_metrics_and_drain_are_requested_with_the_current_token(port: int, tmp_p
     assert _Port.heard == [("GET", "/metrics", bearer(first)), ("POST", "/drain?wait=2.5", bearer(second))]
 
 
-@pytest.mark.system
-def test_without_a_token_file_no_token_is_sent(port: int) -> None:
-    Instance(port).page()
-
-    assert _Port.heard == [("GET", "/metrics", None)]
-
-
-@pytest.mark.system
-def test_a_missing_token_means_that_no_server_runs(port: int, tmp_path: Path) -> None:
-    with pytest.raises(Disconnected, match="cannot read the control token"):
-        Instance(port, tmp_path / "none").page()
-
-    assert _Port.heard == []
-
-
 def test_the_unit_makes_the_token_before_any_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Nobody(Disconnected):
         pass
@@ -107,21 +92,11 @@ def test_the_unit_makes_the_token_before_any_request(tmp_path: Path, monkeypatch
     assert len(read_control_token(token)) == 64
 
 
-class Bucket(MemoryStore):
-    """A bucket that may be away."""
-
-    is_away = False
-
-    def get(self, name: str) -> bytes:
-        if self.is_away:
-            raise StoreError("AWS does not answer")
-        return super().get(name)
-
-
 def test_a_server_starts_again_without_the_bucket_but_only_with_what_this_boot_has_fetched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bucket = Bucket()
+    bucket = FakeStore()
+    away = fail_with(StoreError("AWS does not answer"), "get")
     monkeypatch.setattr(agent, "make_client", lambda *_: None)
     monkeypatch.setattr(agent, "open_bucket", lambda *_: bucket)
     (tmp_path / "settings.json").write_text('{"context": {"rse-pf": {}}}')
@@ -131,11 +106,11 @@ def test_a_server_starts_again_without_the_bucket_but_only_with_what_this_boot_h
         "--state", str(tmp_path),
     ]  # fmt: skip
     (tmp_path / "run").mkdir()
-    bucket.is_away = True
+    bucket.before = away
     assert main(command) == 2, "a new machine has nothing"
-    bucket.is_away = False
+    bucket.before = do_nothing
     assert main(command) == 0
-    bucket.is_away = True
+    bucket.before = away
 
     assert main(command) == 0
     shutil.rmtree(tmp_path / "run")  # as a boot does

@@ -5,16 +5,16 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rse_pf.errors import StoreError
 from rse_pf.server.jobs.lease import JobLease, JobRecord, decode_record, verdict_on
 from rse_pf.server.jobs.record_gc import RecordCollector
 from rse_pf.storage.object_store import MemoryStore
+from tests.kit.fake_store import FakeStore, do_nothing
 
 LIFE_S, LEASE_S = 1000.0, 5.0
 NAME = "jobs/default/robot-1/" + "ab" * 32
 
 
-class Bench:
+class CollectedRecords:
     """A store, a sweep, and clocks that go when the test says so."""
 
     def __init__(self, store: MemoryStore | None = None) -> None:
@@ -48,7 +48,7 @@ def put(store: MemoryStore, record: JobRecord, name: str = NAME) -> None:
 
 @pytest.mark.parametrize("state", ["done", "failed", "given-up", "running"])
 def test_an_unchanged_record_is_deleted_after_its_ttl_and_not_before(state):
-    bench = Bench()
+    bench = CollectedRecords()
     put(bench.store, JobRecord(state=state, owner="gone"))
 
     assert bench.after(0) == 0
@@ -58,31 +58,16 @@ def test_an_unchanged_record_is_deleted_after_its_ttl_and_not_before(state):
     assert bench.names == []
 
 
-def test_a_running_job_keeps_its_record_however_long_it_takes():
-    bench = Bench()
-    lease = bench.lease()
-    assert lease.take()
-
-    for _ in range(5):
-        assert bench.after(LIFE_S / 2) == 0
-        lease.renew(0.5, "half")  # the mark of the sweep costs one beat
-        assert lease.renew(0.5, "half")
-
-    assert lease.is_ours
-    assert lease.end(JobRecord(state="done", owner="", reply="r"))
-
-
 def test_a_request_between_tombstone_and_deletion_waits_and_then_gets_a_new_run():
     asked: list[str] = []
 
-    class Watched(MemoryStore):
-        def delete(self, name: str) -> None:
-            reader = JobLease(self, NAME, "reader", lambda: bench.now)
+    def read_before_deletion(operation: str, name: str, data: bytes) -> None:
+        if operation == "delete":
+            reader = JobLease(bench.store, NAME, "reader", lambda: bench.now)
             record = reader.read()
             asked.append(verdict_on(record, unchanged_s=0.0, lease_s=LEASE_S, is_watched=reader.is_watched))
-            super().delete(name)
 
-    bench = Bench(Watched())
+    bench = CollectedRecords(FakeStore(read_before_deletion))
     put(bench.store, JobRecord(state="done", owner="gone", reply="r", marked_s=bench.now))
 
     assert bench.after(LIFE_S) == 1
@@ -93,16 +78,12 @@ def test_a_request_between_tombstone_and_deletion_waits_and_then_gets_a_new_run(
 
 
 def test_a_job_taken_during_a_garbage_collection_keeps_its_record():
-    class Quick(MemoryStore):
-        races = 1
+    def take_before_the_tombstone(operation: str, name: str, data: bytes) -> None:
+        if operation == "compare_and_swap" and b'"swept"' in data:
+            bench.store.before = do_nothing
+            assert taker.take()
 
-        def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-            if b'"swept"' in data and self.races:
-                self.races -= 1
-                assert taker.take()
-            super().compare_and_swap(name, expected, data)
-
-    bench = Bench(Quick())
+    bench = CollectedRecords(FakeStore(take_before_the_tombstone))
     put(bench.store, JobRecord(state="given-up", owner="gone", marked_s=bench.now))
     taker = bench.lease()
 
@@ -117,30 +98,3 @@ def test_the_tombstone_of_an_interrupted_collection_delays_a_job_by_at_most_a_le
 
     assert verdict_on(record, unchanged_s=LEASE_S - 0.1, lease_s=LEASE_S, is_watched=False) == "follow"
     assert verdict_on(record, unchanged_s=LEASE_S, lease_s=LEASE_S, is_watched=False) == "take"
-
-
-def test_records_are_read_a_few_at_a_time_and_listed_once_an_hour():
-    bench = Bench()
-    names = [f"jobs/default/robot-1/{number:064x}" for number in range(100)]
-    for name in names:
-        put(bench.store, JobRecord(state="done", owner="", marked_s=1.0), name)
-
-    assert bench.sweep.collect() == 64
-    assert bench.sweep.collect() == 36
-    put(bench.store, JobRecord(state="done", owner="", marked_s=1.0))
-    assert bench.sweep.collect() == 0
-    bench.now += 3600
-    assert bench.sweep.collect() == 1
-
-
-def test_after_a_failure_of_the_store_or_an_invalid_record_it_goes_on_later():
-    class Gone(MemoryStore):
-        def list(self, prefix: str = ""):
-            raise StoreError("gone")
-
-    assert Bench(Gone()).sweep.collect() == 0
-    bench = Bench()
-    bench.store.put("jobs/default/robot-0/0", b"nonsense")
-    put(bench.store, JobRecord(state="done", owner="", marked_s=1.0))
-    assert bench.sweep.collect() == 1
-    assert bench.names == ["jobs/default/robot-0/0"]

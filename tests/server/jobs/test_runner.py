@@ -23,6 +23,7 @@ from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.server.jobs.slots import JobSlots, make_slot_file
 from rse_pf.storage.object_store import MemoryStore, digest_of
+from tests.kit.fake_store import FakeStore, fail_with
 
 SETTINGS = PlatformSettings.from_dict(
     {
@@ -74,7 +75,7 @@ class Clock:
         return next(self._ticks) * 0.01
 
 
-class Bench:
+class RunJobs:
     def __init__(self) -> None:
         self.store: MemoryStore = MemoryStore()
         self.processes: list[FakeProcess] = []
@@ -109,7 +110,7 @@ class Bench:
 
 @pytest.fixture
 def bench():
-    bench = Bench()
+    bench = RunJobs()
     yield bench
     bench.signals.close()
     for process in bench.processes:
@@ -120,34 +121,10 @@ def code(outcome: JobOutcome) -> str:
     return "ok" if outcome.error is None else outcome.error.code
 
 
-def another(bench: Bench) -> JobLease:
+def another(bench: RunJobs) -> JobLease:
     lease = JobLease(bench.store, NAME, "another", Clock())
     lease.read()
     return lease
-
-
-class Ordered(MemoryStore):
-    """Fails if a job is done before its reply is stored."""
-
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        if name.startswith("accounts/"):
-            super().compare_and_swap(name, expected, data)
-            return
-        record = msgspec.json.decode(data, type=JobRecord)
-        if record.state == "done":
-            self.get(object_name(RobotId("default", "robot-1"), record.reply))
-        super().compare_and_swap(name, expected, data)
-
-
-def test_a_result_is_stored_before_it_is_reported(bench):
-    bench.store = Ordered()
-
-    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))
-
-    assert outcome == JobOutcome(object=digest_of(REPLY), reply=REPLY, compute_ms=12.5)
-    assert bench.store.get(object_name(RobotId("default", "robot-1"), outcome.object)) == REPLY
-    assert (bench.record.state, bench.record.reply) == ("done", outcome.object)
-    assert [what for _, what in bench.told] == ["waits for its turn", "starts", "half"]
 
 
 @pytest.mark.parametrize("script", [[DONE], [], [["failed", "bad-request", "no", ""]]])
@@ -166,19 +143,10 @@ def test_a_job_runs_in_a_worker_with_more_than_1024_descriptors():
     with contextlib.ExitStack() as opened, open(os.devnull) as file:
         for _ in range(1100):
             opened.callback(os.close, os.dup(file.fileno()))
-        bench = Bench()
+        bench = RunJobs()
 
         assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
         bench.signals.close()
-
-
-def test_a_large_reply_is_reported_by_name_only(bench):
-    reply = msgspec.msgpack.encode({"value": "x" * 600})
-
-    first = bench.run(lambda: FakeProcess([["done", 12.5, reply]]))
-
-    assert (first.reply, first.object) == (None, digest_of(reply))
-    assert bench.run() == first
 
 
 def test_a_result_whose_object_was_deleted_is_computed_again(bench):
@@ -187,21 +155,6 @@ def test_a_result_whose_object_was_deleted_is_computed_again(bench):
 
     assert bench.run(lambda: FakeProcess([DONE])) == outcome
     assert len(bench.processes) == 2
-
-
-def test_a_failure_is_reported_unchanged_and_the_next_request_runs_again(bench):
-    outcome = bench.run(lambda: FakeProcess([["failed", "bad-request", "no maps", "send some"]]))
-
-    assert code(outcome) == "bad-request"
-    assert outcome.error is not None
-    assert (outcome.error.message, outcome.error.hint) == ("no maps", "send some")
-    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
-
-
-def test_a_reply_that_is_too_large_ends_the_job(bench):
-    outcome = bench.run(lambda: FakeProcess([["done", 1.0, b"x" * 5000]], ends=False))
-
-    assert code(outcome) == "too-large"
 
 
 def test_a_process_that_ignores_the_cancel_is_killed(bench):
@@ -217,42 +170,6 @@ def test_a_result_that_arrives_before_the_cancel_is_processed_is_kept(bench):
     bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
 
     assert code(bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))) == "ok"
-
-
-def test_a_draining_server_gives_up_its_job_so_that_others_take_it_at_once(bench):
-    bench.on_tell = lambda share, what: bench.signals.give_up() if what == "half" else None
-
-    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
-
-    assert outcome.is_given_up
-    assert bench.record.state == "given-up"
-
-
-def test_a_job_that_runs_on_another_server_is_followed_to_its_end(bench):
-    owner = another(bench)
-    owner.take()
-    owner.renew(0.25, "quarter")
-
-    def end(share: float, what: str) -> None:
-        if owner.record is not None and owner.record.state == "running":
-            bench.store.put(object_name(RobotId("default", "robot-1"), digest_of(REPLY)), REPLY)
-            owner.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
-
-    bench.on_tell = end
-
-    assert bench.run().object == digest_of(REPLY)
-    assert bench.told == [(0.25, "quarter")]
-    assert bench.processes == []
-
-
-def test_the_failure_of_a_followed_job_is_reported_and_not_retried(bench):
-    owner = another(bench)
-    owner.take()
-    failed = JobRecord(state="failed", owner="", code="crashed", message="it ended")
-    bench.on_tell = lambda share, what: owner.end(failed)
-
-    assert code(bench.run()) == "crashed"
-    assert bench.processes == []
 
 
 def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owner(bench):
@@ -271,64 +188,42 @@ def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owne
     assert bench.record.owner == "another"
 
 
-class Faulty(MemoryStore):
-    """Fails for the first renewals of a running job, then calls *recovered*."""
-
-    def __init__(self, failures: int, recovered: Callable[[], None]) -> None:
-        super().__init__()
-        self.failures = failures
-        self._recovered = recovered
-
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        if expected is not None and self.failures > 0:
-            self.failures -= 1
-            if self.failures == 0:
-                self._recovered()
-            raise StoreError("503")
-        super().compare_and_swap(name, expected, data)
-
-
 @pytest.mark.parametrize("failures", [2, 20], ids=["shorter than the lease", "longer than the lease"])
 def test_a_failure_of_the_store_does_not_end_a_job(bench, failures):
-    bench.store = Faulty(failures, lambda: bench.processes[0].theirs.sendall(encode_message(DONE)))
+    renewals = 0
+
+    def fail_first_renewals(operation: str, name: str, data: bytes) -> None:
+        nonlocal renewals
+        if operation == "compare_and_swap" and bench.processes and renewals < failures:
+            renewals += 1
+            if renewals == failures:
+                bench.processes[0].theirs.sendall(encode_message(DONE))
+            raise StoreError("503")
+
+    bench.store = FakeStore(fail_first_renewals)
 
     assert code(bench.run(lambda: FakeProcess([], ends=False))) == "ok"
-    assert bench.store.failures == 0
+    assert renewals == failures
     assert bench.record.tries == 1
 
 
 def test_a_store_that_fails_is_a_typed_failure(bench):
-    class Gone(MemoryStore):
-        def get(self, name: str) -> bytes:
-            raise StoreError("gone")
-
-    bench.store = Gone()
+    bench.store = FakeStore(fail_with(StoreError("gone"), "get"))
 
     assert code(bench.run()) == "store"
 
 
 def test_the_outcome_is_written_again_after_a_conflict(bench):
-    class Racing(MemoryStore):
-        races = 1
+    conflicts = [Conflict("somebody asked to cancel")]
 
-        def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-            if b'"done"' in data and self.races:
-                self.races -= 1
-                raise Conflict("somebody asked to cancel")
-            super().compare_and_swap(name, expected, data)
+    def conflict_once(operation: str, name: str, data: bytes) -> None:
+        if operation == "compare_and_swap" and b'"done"' in data and conflicts:
+            raise conflicts.pop()
 
-    bench.store = Racing()
+    bench.store = FakeStore(conflict_once)
 
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
     assert bench.record.state == "done"
-
-
-def test_a_reply_that_the_process_stored_is_reported_by_its_name(bench):
-    outcome = bench.run(lambda: FakeProcess([["stored", 12.5, "ab" * 32, 10**6, None]]))
-
-    assert outcome == JobOutcome(object="ab" * 32, reply=None, compute_ms=12.5)
-    assert (bench.record.state, bench.record.reply, bench.record.reply_bytes) == ("done", "ab" * 32, 10**6)
-    assert [info.name for info in bench.store.list("objects/")] == []
 
 
 def test_a_reply_above_the_robots_quota_is_a_typed_failure_and_not_stored(bench):

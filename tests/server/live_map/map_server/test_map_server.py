@@ -10,64 +10,25 @@ import pytest
 
 from rse_pf.errors import BadRequest, Conflict, InternalError, NotFound, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, decode_events
+from rse_pf.live_map.events import Event, KeyframeAdded
 from rse_pf.live_map.outcomes import Joined, Outcome, Unaligned
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.server.live_map.lease import next_action
 from rse_pf.server.live_map.map_server.environment import MapImplementation
-from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.server.live_map.map_server.map_server import MapMoving
-from rse_pf.storage.object_store import MemoryStore
 from tests.kit.fake_map import FAKE_MAP, FakeMap
+from tests.kit.fake_store import FakeStore, do_nothing, fail_with
 from tests.kit.map_server_setup import (
     FOLDER,
     MAP,
     ROBOT,
-    Bench,
     FailingStore,
     InlineThreads,
+    MapServerSetup,
     settle,
 )
 
 _T = TypeVar("_T")
 OTHER = RobotId("default", "robot-2", "thumb")
-
-
-class Store(MemoryStore):
-    """Refuses leases while it is down."""
-
-    is_down = False
-
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        if self.is_down:
-            raise StoreError("down")
-        super().compare_and_swap(name, expected, data)
-
-
-async def test_a_keyframe_is_acknowledged_when_it_is_durable():
-    bench = Bench(store := Store())
-
-    server = await bench.start("a")
-    store.is_down = True
-    sent = asyncio.ensure_future(server.keyframe(0))
-    await bench.clock.advance(1.0)
-    assert not sent.done()
-    assert server.state.keyframes == 0
-    assert server.newest("map")["state"] == "waiting for the store"
-    store.is_down = False
-    await bench.clock.advance(2.0)
-    assert (await sent)["number"] == 1
-    assert server.newest("map")["state"] == "live"
-    assert bench.replayed().digest() == server.state.digest()
-
-
-async def test_a_keyframe_that_is_sent_again_is_acknowledged_and_not_added_twice():
-    bench = Bench()
-
-    server = await bench.start("a")
-    await asyncio.gather(server.keyframe(0), server.keyframe(0))
-    assert (await server.keyframe(0))["number"] == 1
-    assert server.state.keyframes == 1
 
 
 async def test_the_log_says_when_a_robot_is_aligned_and_when_it_no_longer_is():
@@ -80,7 +41,7 @@ async def test_the_log_says_when_a_robot_is_aligned_and_when_it_no_longer_is():
                 outcomes.append(Unaligned(robot=event.robot, segment=0, reason="no loop closure"))
             return outcomes
 
-    bench = Bench(
+    bench = MapServerSetup(
         implementation=MapImplementation(
             empty=Joining, restore=Joining.restore, started_from=FAKE_MAP.started_from
         )
@@ -95,7 +56,7 @@ async def test_the_log_says_when_a_robot_is_aligned_and_when_it_no_longer_is():
 
 
 async def test_keyframes_of_one_robot_may_be_on_their_way_at_the_same_time_but_none_ahead():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     await asyncio.gather(*(server.keyframe(number) for number in range(5)))
@@ -105,7 +66,7 @@ async def test_keyframes_of_one_robot_may_be_on_their_way_at_the_same_time_but_n
 
 
 async def test_malformed_keyframes_are_refused_before_they_are_logged_also_behind_one_that_is_being_written():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     _, bad = await asyncio.gather(server.keyframe(0), server.keyframe(1, b"bad"), return_exceptions=True)
@@ -118,7 +79,7 @@ async def test_malformed_keyframes_are_refused_before_they_are_logged_also_behin
 
 
 async def test_keyframes_that_arrive_during_a_write_share_the_next_entry():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     robots = [RobotId("default", f"r{row}") for row in range(8)]
@@ -130,7 +91,7 @@ async def test_keyframes_that_arrive_during_a_write_share_the_next_entry():
 
 
 async def test_keyframes_are_acknowledged_while_loop_closures_of_an_earlier_one_are_measured():
-    bench = Bench()
+    bench = MapServerSetup()
     may_look = asyncio.Event()
 
     class Threads(InlineThreads):
@@ -152,7 +113,7 @@ async def test_keyframes_are_acknowledged_while_loop_closures_of_an_earlier_one_
 
 
 async def test_an_optimisation_that_fails_does_not_end_the_map_server():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     server.state.live_map.prepare_optimisation = lambda solve: [].index(0)  # type: ignore[attr-defined]
@@ -164,7 +125,7 @@ async def test_an_optimisation_that_fails_does_not_end_the_map_server():
 
 async def test_a_map_server_that_was_paused_acknowledges_nothing_more_and_ends():
     """As after SIGSTOP: another process takes the map and writes while this one is paused."""
-    bench = Bench()
+    bench = MapServerSetup()
 
     old = await bench.start("a")
     await old.keyframe(0)
@@ -188,7 +149,7 @@ async def test_a_map_server_that_was_paused_acknowledges_nothing_more_and_ends()
 
 async def test_an_old_map_server_acknowledges_nothing_even_if_its_entry_number_is_free_again():
     """The new map server has deleted the entry whose number the old one tries to write."""
-    bench = Bench()
+    bench = MapServerSetup()
 
     old = await bench.start("a")
     await old.keyframe(0)
@@ -217,24 +178,8 @@ async def test_an_old_map_server_acknowledges_nothing_even_if_its_entry_number_i
     assert third.lease.record.epoch == 3
 
 
-async def test_a_new_map_server_holds_the_same_map_and_goes_on_where_the_old_one_ended():
-    bench = Bench(keeps_all=True)
-
-    old = await bench.start("a")
-    for number in range(230):
-        await old.keyframe(number)
-    await settle()
-    bench.clock.now_s += 10.0
-    new = await bench.start("b")
-    assert new.log.position > 400
-    assert new.state.keyframes == 230
-    assert new.state.digest() == bench.replayed().digest()
-    assert (await new.keyframe(229))["number"] == 230
-    assert (await new.keyframe(230))["number"] == 231
-
-
 async def test_keyframes_without_logged_loop_closures_are_measured_by_the_next_map_server():
-    bench = Bench()
+    bench = MapServerSetup()
 
     old = await bench.start("a")
     old.state.prepare_measurement = lambda keyframe, parts: (_ for _ in ()).throw(KeyError)  # type: ignore[method-assign]
@@ -252,7 +197,7 @@ async def test_keyframes_without_logged_loop_closures_are_measured_by_the_next_m
 @pytest.mark.parametrize("seed", range(5))
 async def test_a_store_that_fails_three_times_in_ten_loses_and_doubles_nothing(seed: int):
     """The store fails before a change, or after it, so that the map server does not know of its entry."""
-    bench = Bench(store := FailingStore(seed=seed))
+    bench = MapServerSetup(store := FailingStore(seed=seed))
 
     server = await bench.start("a")
     store.share = 0.3
@@ -272,7 +217,7 @@ async def test_a_store_that_fails_three_times_in_ten_loses_and_doubles_nothing(s
 
 
 async def test_a_crash_between_log_and_acknowledgement_is_a_known_keyframe_afterwards():
-    bench = Bench()
+    bench = MapServerSetup()
 
     old = await bench.start("a")
     real = old.log.write_entry
@@ -292,84 +237,39 @@ async def test_a_crash_between_log_and_acknowledgement_is_a_known_keyframe_after
     assert new.state.keyframes == 1
 
 
-async def test_a_release_writes_a_snapshot_and_frees_the_map_at_once():
-    bench = Bench()
-
-    server = await bench.start("a")
-    await server.keyframe(0)
-    await settle()
-    await server.map_server.release()
-    assert await server.run == "released"
-    assert bench.lease().state == "released"
-    assert next_action(bench.lease(), unchanged_s=0.0, lease_s=1.5) == "claim"
-    assert [info.name for info in bench.store.list(f"{FOLDER}snapshot/")]
-    with pytest.raises(MapMoving):
-        await server.keyframe(1)
-    new = await bench.start("b")
-    assert new.state.keyframes == 1
-    assert new.lease.record.tries == 0
-
-
 async def test_nothing_is_sent_while_the_lease_is_not_renewed():
-    bench = Bench(store := Store())
+    bench = MapServerSetup(store := FakeStore())
 
     server = await bench.start("a")
     await server.keyframe(0)
     await settle()
-    store.is_down = True
+    store.before = fail_with(StoreError("down"), "compare_and_swap")
     await bench.clock.advance(2.0)
     asked = asyncio.ensure_future(server.ask("live-show"))
     await settle()
     assert not asked.done()  # another process might own the map
-    store.is_down = False
+    store.before = do_nothing
     await bench.clock.advance(1.0)
     assert (await asked)["keyframes"] == 1
 
 
 async def test_a_subscriber_that_comes_while_the_lease_is_too_old_gets_the_updates_after_its_renewal():
-    bench = Bench(store := Store())
+    bench = MapServerSetup(store := FakeStore())
 
     server = await bench.start("a")
     await server.keyframe(0)
     await settle()
-    store.is_down = True
+    store.before = fail_with(StoreError("down"), "compare_and_swap")
     await bench.clock.advance(2.0)
     assert server.map_server.current_updates() == []
     server.sent_updates.clear()
-    store.is_down = False
+    store.before = do_nothing
     await bench.clock.advance(1.0)
     assert {payload["kind"] for payload in server.sent_updates} == {"map", "alignment", "pose"}
 
 
-async def test_a_map_server_that_has_measured_a_keyframe_counts_as_stable():
-    """Otherwise takeovers on a busy machine would be delayed as if the map had killed its map servers."""
-    bench = Bench()
-
-    await bench.start("a")
-    bench.clock.now_s += 10.0
-    second = await bench.start("b")
-    await bench.clock.advance(1.0)
-    assert bench.lease().tries == 1
-    await second.keyframe(0)
-    await bench.clock.advance(1.0)
-    assert bench.lease().tries == 0
-
-
-async def test_what_a_robot_contributed_can_be_taken_out_and_a_stranger_is_not_found():
-    bench = Bench()
-
-    server = await bench.start("a")
-    await server.keyframe(0)
-    await server.keyframe(0, robot=OTHER)
-    with pytest.raises(NotFound, match="'robot-3' contributed nothing"):
-        await server.ask("live-forget", {"robot": "robot-3"})
-    assert (await server.ask("live-forget", {"robot": "robot-2"}))["forgotten"] == 1
-    assert server.state.keyframes == 1
-    assert (await server.keyframe(0, robot=OTHER))["number"] == 1
-
-
 async def test_a_map_is_published_when_the_last_robot_leaves_and_the_same_map_only_once():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     maps = MapRegistry(bench.store, "default")
@@ -387,25 +287,8 @@ async def test_a_map_is_published_when_the_last_robot_leaves_and_the_same_map_on
     assert reply == {"name": MAP, "version": maps.head(MAP).id, "number": 1, "keyframes": 2}
 
 
-async def test_a_map_that_changes_is_published_every_so_often(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rse_pf.server.live_map.map_server.map_server.PUBLISH_INTERVAL_S", 5.0)
-    bench = Bench()
-
-    server = await bench.start("a")
-    server.map_server.users = 1
-    await server.keyframe(0)
-    await bench.clock.advance(6.0)
-    maps = MapRegistry(bench.store, "default")
-    assert maps.head(MAP).number == 1
-    await bench.clock.advance(12.0)
-    assert maps.head(MAP).number == 1  # unchanged
-    await server.keyframe(1)
-    await bench.clock.advance(6.0)
-    assert maps.head(MAP).number == 2
-
-
 async def test_a_map_server_notifies_its_worker_whether_commands_arrive():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     server.map_server.users = 1
@@ -420,7 +303,7 @@ async def test_a_map_server_notifies_its_worker_whether_commands_arrive():
 
 
 async def test_a_stopped_map_is_published_and_begins_anew_without_its_past():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     await server.keyframe(0)
@@ -440,34 +323,8 @@ async def test_a_stopped_map_is_published_and_begins_anew_without_its_past():
         await new.ask("live-start", {"from": MAP})
 
 
-async def test_an_empty_map_logs_the_size_of_rooms_that_look_the_same():
-    bench = Bench()
-
-    server = await bench.start("a")
-    with pytest.raises(BadRequest):
-        await server.ask("live-start", {"equal_rooms_m": -1.0})
-    await server.ask("live-start", {"equal_rooms_m": 5.0})
-    log = LiveLog(bench.store, FOLDER, owner="replay", epoch=1)
-    events = [event for entry in log.read_entries() for event in decode_events(entry.events)]
-    assert [event.equal_rooms_m for event in events if isinstance(event, MapStarted)] == [5.0]
-
-
-async def test_a_map_server_that_nobody_uses_publishes_and_releases_its_map():
-    bench = Bench(idle_s=3.0)
-
-    server = await bench.start("a")
-    await server.keyframe(0)
-    server.map_server.users = 1
-    await bench.clock.advance(5.0)
-    assert not server.run.done()
-    server.map_server.users = 0
-    await bench.clock.advance(5.0)
-    assert await server.run == "released"
-    assert MapRegistry(bench.store, "default").head(MAP).keyframes == 1
-
-
 async def test_a_defect_of_the_map_refuses_one_keyframe_and_the_next_one_is_taken():
-    bench = Bench(keeps_all=True)
+    bench = MapServerSetup(keeps_all=True)
 
     server = await bench.start("a")
     with pytest.raises(InternalError):
@@ -477,7 +334,7 @@ async def test_a_defect_of_the_map_refuses_one_keyframe_and_the_next_one_is_take
 
 
 async def test_updates_name_the_cause_and_a_new_reader_gets_the_present_state():
-    bench = Bench()
+    bench = MapServerSetup()
 
     server = await bench.start("a")
     await server.keyframe(0)
@@ -499,7 +356,7 @@ async def test_updates_name_the_cause_and_a_new_reader_gets_the_present_state():
 
 @pytest.mark.parametrize("operation", ["live-publish", "live-stop"])
 async def test_a_map_that_the_registry_refuses_is_an_internal_error_for_who_asks(operation, monkeypatch):
-    bench = Bench()
+    bench = MapServerSetup()
 
     def refuse(*args: object, **named: object) -> None:
         raise BadRequest("keyframe 1 has no rigid pose", hint="leave it out")

@@ -11,7 +11,8 @@ from rse_pf.errors import Conflict, QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import MemoryStore, ObjectStore, charge_of
-from tests.kit.map_server_setup import FOLDER, MAP, Bench, RunningMapServer, settle
+from tests.kit.fake_store import FakeStore, do_nothing
+from tests.kit.map_server_setup import FOLDER, MAP, MapServerSetup, RunningMapServer, settle
 
 OTHER = RobotId("default", "robot-2", "thumb")
 QUOTA = 1_000_000
@@ -38,7 +39,7 @@ def stored(store: ObjectStore, *areas: str) -> int:
 
 @pytest.mark.parametrize("leaves", [False, True])
 async def test_a_tenant_fills_its_quota_with_live_maps_and_no_more(leaves: bool) -> None:
-    bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0)
+    bench = MapServerSetup(MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0)
 
     server = await bench.start("a")
     server.map_server.users = 1
@@ -53,7 +54,7 @@ async def test_a_tenant_fills_its_quota_with_live_maps_and_no_more(leaves: bool)
 
 
 async def test_over_the_quota_a_map_is_shown_forgotten_and_stopped_and_then_there_is_room() -> None:
-    bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA})
+    bench = MapServerSetup(MemoryStore(), data={"tenant_quota_bytes": QUOTA})
 
     server = await bench.start("a")
     server.map_server.users = 1
@@ -72,7 +73,9 @@ async def test_over_the_quota_a_map_is_shown_forgotten_and_stopped_and_then_ther
 
 
 async def test_a_robot_that_always_drives_fills_a_quarter_of_the_quota_with_versions_and_no_more() -> None:
-    bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0, keep_versions=1000)
+    bench = MapServerSetup(
+        MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0, keep_versions=1000
+    )
 
     server = await bench.start("a")
     server.map_server.users = 1
@@ -85,36 +88,17 @@ async def test_a_robot_that_always_drives_fills_a_quarter_of_the_quota_with_vers
     assert stored(bench.store, "live/", "maps/") <= QUOTA
 
 
-async def test_a_robot_is_forgotten_over_the_quota() -> None:
-    bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA})
-
-    server = await bench.start("a")
-    await fill(server)
-    assert (await server.ask("live-forget", {"robot": "robot-1"}))["forgotten"] == 1
-    assert server.state.keyframes == 0
-
-
-class FullLog(MemoryStore):
-    """A store that refuses objects of more than 1 kB while it is full."""
-
-    is_full = False
-    writes_anyway = False
-
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        if self.is_full and "/log/" in name and len(data) > 1000:
-            if self.writes_anyway:
-                super().compare_and_swap(name, expected, data)
-            raise StoreFull("no space left", hint="free some space")
-        super().compare_and_swap(name, expected, data)
-
-
 async def test_a_keyframe_that_a_full_disk_cannot_take_is_refused_and_everything_else_goes_on() -> None:
-    store = FullLog()
-    bench = Bench(store)
+    def refuse_long_entries(operation: str, name: str, data: bytes) -> None:
+        if "/log/" in name and len(data) > 1000:
+            raise StoreFull("no space left", hint="free some space")
+
+    store = FakeStore()
+    bench = MapServerSetup(store)
 
     server = await bench.start("a")
     await server.keyframe(0)
-    store.is_full = True
+    store.before = refuse_long_entries
     sent = asyncio.gather(
         server.keyframe(1, bytes(5000)), server.keyframe(0, robot=OTHER), return_exceptions=True
     )
@@ -123,22 +107,7 @@ async def test_a_keyframe_that_a_full_disk_cannot_take_is_refused_and_everything
     assert isinstance(other, StoreFull | dict)
     assert await server.ask("live-leave") == {}
     assert (await server.keyframe(0, robot=OTHER))["number"] == 1
-    store.is_full = False
+    store.before = do_nothing
     assert (await server.keyframe(1, bytes(5000)))["number"] == 2
-    await settle()
-    assert bench.replayed().digest() == server.state.digest()
-
-
-async def test_an_entry_that_was_written_although_the_disk_was_full_is_kept() -> None:
-    store = FullLog()
-    bench = Bench(store)
-
-    server = await bench.start("a")
-    store.is_full = store.writes_anyway = True
-    sent = asyncio.ensure_future(server.keyframe(0, bytes(5000)))
-    await settle()
-    store.is_full = False
-    await bench.clock.advance(2.0)
-    assert (await sent)["number"] == 1
     await settle()
     assert bench.replayed().digest() == server.state.digest()
