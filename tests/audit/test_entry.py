@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,15 +29,6 @@ def test_every_entry_is_one_bounded_line_that_reads_back(actor, action, subject,
     assert len(line) < 1 << 18
 
 
-def test_lone_surrogates_and_numbers_that_json_lacks_are_written_readably():
-    detail = {"a": "\ud800", "b": math.inf, "c": math.nan, "d": 2**80}
-
-    entry = parse_entry(entry_line(Entry(time=1.0, actor="s", action="x", detail=detail)))
-
-    assert entry is not None
-    assert entry.detail == {"a": "?", "b": "inf", "c": "nan", "d": str(2**80)}
-
-
 def test_a_token_never_reaches_the_log():
     entry = Entry(
         time=1.0, actor=A_TOKEN, action=f"x {A_TOKEN}", subject=f"Bearer {A_TOKEN}",
@@ -51,11 +39,6 @@ def test_a_token_never_reaches_the_log():
 
     assert "eyJ" not in line
     assert line.count("(a token)") == 5
-
-
-@pytest.mark.parametrize("line", [b"\n", b"{}\n", b"[]\n", b"\xff\n", b'{"time":1', b"[" * 5000 + b"\n"])
-def test_a_line_that_is_not_an_entry_is_recognised(line: bytes):
-    assert parse_entry(line) is None
 
 
 def test_an_entry_with_the_hash_chain_of_version_0_1_is_read():

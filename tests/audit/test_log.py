@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.audit.entry import Entry
-from rse_pf.audit.log import AuditLog, log_files, log_names, read_entries, read_logs, record_once
+from rse_pf.audit.log import AuditLog, log_files, log_names, read_entries, record_once
 from rse_pf.errors import ConfigurationError
 
 
@@ -46,13 +46,6 @@ def test_a_second_run_appends_to_the_log_of_the_first(tmp_path: Path):
     write(tmp_path, range(3, 5))
 
     assert subjects(tmp_path) == list(range(5))
-
-
-def test_files_are_private(tmp_path: Path):
-    write(tmp_path / "audit", range(1))
-
-    assert (tmp_path / "audit").stat().st_mode & 0o777 == 0o700
-    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "audit").iterdir()} == {0o600}
 
 
 def test_a_log_goes_on_in_a_new_file_when_one_has_grown_large(tmp_path: Path):
@@ -103,15 +96,6 @@ def test_a_folder_that_cannot_be_written_is_an_error_with_a_hint(tmp_path: Path)
     with pytest.raises(ConfigurationError, match="cannot write the audit log") as error:
         log_in(tmp_path / "file")
     assert "--audit" in error.value.hint
-
-
-def test_logs_are_read_in_the_order_of_time(tmp_path: Path):
-    for time_s, who in ((3.0, "a"), (1.0, "b"), (2.0, "a")):
-        record_once(tmp_path, who, "x", wall_clock=lambda at=time_s: at)
-
-    rows = read_logs(path for who in log_names(tmp_path) for path in log_files(tmp_path, who))
-
-    assert [(who, entry.time) for who, entry in rows] == [("b", 1.0), ("a", 2.0), ("a", 3.0)]
 
 
 @pytest.mark.system

@@ -12,8 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.auth.claimed import claimed_by, source_address
-from rse_pf.auth.roster import EnrolledRobot, Roster
-from rse_pf.auth.tokens import KeySet
 from rse_pf.terminal import json_line
 
 HOSTILE = [
@@ -30,32 +28,6 @@ def token_of(claims: Any, key_id: Any = None) -> str:
     return f"{part_of({'alg': 'EdDSA', 'kid': key_id})}.{part_of(claims)}.c2ln"
 
 
-def test_robot_tenant_and_token_are_told_as_claimed():
-    token = token_of({"sub": "robot-9", "tenant": "acme", "jti": "t-9", "exp": 1})
-
-    told = claimed_by(token)
-
-    assert told == {"claimed_robot": "robot-9", "claimed_tenant": "acme", "claimed_token": "t-9"}
-
-
-def test_the_tenant_of_a_robots_own_key_is_that_of_the_roster():
-    robot = EnrolledRobot(robot="robot-9", tenant="acme", x="A" * 43)
-    keys = KeySet({}, roster=Roster(robots=(robot,)))
-    claims = {"sub": "robot-9", "tenant": "default", "jti": "t-9"}
-    named = {"claimed_robot": "robot-9", "claimed_token": "t-9"}
-
-    enrolled = claimed_by(token_of(claims, robot.key_id), keys)
-    removed = claimed_by(token_of(claims, robot.key_id), KeySet({}))
-
-    assert enrolled == {**named, "claimed_tenant": "acme", "claimed_key": robot.key_id}
-    assert removed == {**named, "claimed_key": robot.key_id}
-
-
-@pytest.mark.parametrize("key_id", [7, ["robot:x"], None, "", "robot:", "robot:" + "x" * 900])
-def test_a_key_of_any_form_breaks_nothing(key_id: Any):
-    assert claimed_by(token_of({"sub": "r"}, key_id), KeySet({}))["claimed_robot"] == "r"
-
-
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_name_is_cut_and_breaks_no_line_of_a_log(name: str):
     told = claimed_by(token_of({"sub": name, "tenant": name, "jti": name}))
@@ -66,11 +38,6 @@ def test_a_hostile_name_is_cut_and_breaks_no_line_of_a_log(name: str):
     assert all(len(value) <= 64 for value in told.values())
     assert len(line.splitlines()) == len(line.decode().splitlines()) == 1
     assert not any(sign in line.decode() for sign in "\x1b\x00\x9b\u202e\u2028")
-
-
-@pytest.mark.parametrize("claims", [[], 7, {"sub": ["robot"], "tenant": {"a": 1}, "jti": 7}, {"sub": ""}])
-def test_claims_of_a_wrong_type_are_left_out(claims: Any):
-    assert claimed_by(token_of(claims)) == {}
 
 
 @given(st.text())

@@ -6,8 +6,6 @@ import base64
 import hashlib
 import hmac
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -16,11 +14,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rse_pf.auth import tokens
-from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster
-from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
+from rse_pf.auth.roster import DenyList, Roster
+from rse_pf.auth.tokens import KeySet, SigningKey, token_problem, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
-from rse_pf.identity import RobotId
 
 NOW = 1_790_000_000.0
 SETTINGS = AuthSettings()
@@ -57,15 +54,6 @@ def refused(token: str, *, now: float = NOW, settings: AuthSettings = SETTINGS) 
 
 def without(name: str) -> dict[str, Any]:
     return {key: value for key, value in GOOD.items() if key != name}
-
-
-def test_a_good_token_says_who_the_robot_is() -> None:
-    token = issue(scopes=("services:pnp", "maps:*"), tenant="lab", ttl_s=60.0)
-
-    assert verify_token(token, keys=KEYS, now=NOW + 1, settings=SETTINGS) == Claims(
-        robot=RobotId("lab", "robot-7"), token_id="t1", issued_s=NOW, expires_s=NOW + 60, key_id="key-1",
-        scopes=("services:pnp", "maps:*"),
-    )  # fmt: skip
 
 
 PUBLIC = KEY._private.public_key().public_bytes_raw()
@@ -207,13 +195,6 @@ def test_the_leeway_is_kept_to_the_second() -> None:
     assert refused(token, now=NOW - 1 - SETTINGS.leeway_s) == "not-yet-valid"
 
 
-def test_not_before_has_the_same_leeway() -> None:
-    token = sign({**GOOD, "nbf": NOW + SETTINGS.leeway_s})
-
-    assert verify_token(token, keys=KEYS, now=NOW, settings=SETTINGS).robot.name == "robot-7"
-    assert refused(token, now=NOW - 1) == "not-yet-valid"
-
-
 @pytest.mark.parametrize("ttl_s", [0.0, -1.0, SETTINGS.token_ttl_s + 1.0, float("nan"), float("inf")])
 def test_a_ttl_outside_the_settings_is_not_issued(ttl_s: float) -> None:
     with pytest.raises(UsageError, match="a time to live of"):
@@ -232,25 +213,6 @@ def test_a_token_id_that_no_server_would_accept_is_not_issued(token_id: str) -> 
         KEY.issue("robot-7", now=NOW, token_id=token_id, settings=SETTINGS)
 
 
-def test_keys_survive_encoding_and_two_can_be_valid_at_once() -> None:
-    copy = SigningKey.from_json(KEY.to_json())
-    second = SigningKey.from_seed(bytes(32), "key-2")
-    both = KeySet.from_json(
-        json.dumps({"keys": [json.loads(each.key_set().to_json())["keys"][0] for each in (KEY, second)]})
-    )
-
-    for key in (copy, second):
-        token = key.issue("robot-7", now=NOW, token_id="t1", settings=SETTINGS)
-        assert verify_token(token, keys=both, now=NOW, settings=SETTINGS).key_id == key.key_id
-
-
-def test_the_public_half_does_not_hold_the_private_one() -> None:
-    secret = json.loads(KEY.to_json())["d"]
-
-    assert secret not in KEY.key_set().to_json()
-    assert secret not in repr(KEY)
-
-
 @pytest.mark.parametrize(
     "text", ["", "[]", "{}", '{"d": 3, "kid": "x"}', '{"d": "AA", "kid": "x"}', "[" * 9999]
 )
@@ -267,25 +229,7 @@ def test_what_is_no_key_set_is_a_usage_error(text: str) -> None:
         KeySet.from_json(text)
 
 
-def test_who_reads_a_key_set_can_verify_a_token_without_another_import() -> None:
-    code = """if True:
-        import sys
-        from rse_pf.auth.tokens import KeySet
-        KeySet.from_json(sys.argv[1])
-        sys.exit(0 if "jwt" in sys.modules else "PyJWT is not imported")
-    """
-
-    done = subprocess.run(
-        [sys.executable, "-c", code, KEYS.to_json()], capture_output=True, text=True, check=False
-    )
-
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 # --- tokens that were verified before ---------------------------------------------------------------
-
-ROBOT_KEY = SigningKey.of_robot(bytes(range(2, 34)))
-ENROLLED = EnrolledRobot(robot="robot-7", x=json.loads(ROBOT_KEY.public_json())["x"])
 
 
 class Counting(KeySet):
@@ -302,15 +246,6 @@ def trusted(roster: Roster | None = None, denied: DenyList | None = None) -> Cou
     return Counting(KEYS._keys, roster=roster, denied=denied)
 
 
-def test_the_signature_of_a_token_is_verified_once():
-    keys, token = trusted(), issue()
-
-    first = verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
-
-    assert verify_token(token, keys=keys, now=NOW + 1, settings=SETTINGS) == first
-    assert keys.taken == 1
-
-
 def test_the_times_of_a_verified_token_are_judged_every_time():
     keys, token = trusted(), issue(ttl_s=60.0)
     verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
@@ -321,14 +256,6 @@ def test_the_times_of_a_verified_token_are_judged_every_time():
         assert token_problem(caught.value) == reason
 
 
-def test_a_verified_token_counts_for_the_issuer_and_the_audience_that_it_was_verified_for():
-    keys, token = trusted(), issue()
-    verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
-
-    with pytest.raises(Unauthorized):
-        verify_token(token, keys=keys, now=NOW, settings=AuthSettings(audience="another"))
-
-
 def test_another_roster_or_deny_list_remembers_no_token():
     token = issue()
     verify_token(token, keys=(keys := trusted()), now=NOW, settings=SETTINGS)
@@ -337,17 +264,6 @@ def test_another_roster_or_deny_list_remembers_no_token():
     with pytest.raises(Unauthorized) as caught:
         verify_token(token, keys=keys.with_access_control(Roster(), denied), now=NOW, settings=SETTINGS)
     assert token_problem(caught.value) == "revoked"
-
-
-def test_tokens_that_are_refused_are_not_remembered():
-    keys = trusted(Roster(robots=(ENROLLED,)))
-    wrong = ROBOT_KEY.issue("robot-8", now=NOW, token_id="t", settings=SETTINGS)
-    for token in (wrong, sign(GOOD, key=OTHER), issue()[:-4] + "AAAA"):
-        for _ in range(2):
-            with pytest.raises(Unauthorized):
-                verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
-
-    assert (len(keys._signed), len(keys._digests)) == (0, 0)
 
 
 def test_a_robot_has_one_place_among_the_remembered_tokens_and_their_number_is_bounded(monkeypatch):

@@ -81,27 +81,6 @@ def test_endless_races_end_with_an_error():
         AccessControlStore(Racing(races=1000)).change_deny_list(with_robot)
 
 
-def test_missing_objects_are_created_once_and_existing_ones_are_kept():
-    store = MemoryStore()
-    room = AccessControlStore(store)
-    room.create_missing()
-    room.change_deny_list(with_robot)
-    room.create_missing()
-
-    assert room.deny_list().is_disabled("default", "r")
-    assert room.roster().robots == ()
-
-
-def test_a_platform_without_roster_and_deny_list_trusts_its_keys(keys_file: Path):
-    trust = TrustStore(keys_file)
-    trust.load()
-
-    assert trust.keys is not None
-    assert trust.keys.denies(CLAIMS) == ""
-    assert trust.refresh() is False
-    assert trust.problem == ""
-
-
 def test_a_refresh_finds_changes_and_the_snapshot_holds_them(keys_file: Path, room: AccessControlStore):
     trust = TrustStore(keys_file)
     trust.load()

@@ -138,58 +138,6 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
     assert changed.digest() != PlatformSettings().digest()
 
 
-def test_the_digest_is_the_same_wherever_the_settings_are() -> None:
-    one = PlatformSettings.from_dict({"local": {"port": 0}, "pnp": {"engine": "opencv"}})
-    same = PlatformSettings.from_dict({"pnp": {"engine": "opencv"}, "local": {"port": 0, "servers": 2}})
-
-    assert one.digest() == same.digest()
-    assert len(one.digest()) == 16
-
-
-def test_all_settings_survive_a_round_trip_through_json() -> None:
-    settings = PlatformSettings.from_dict({"scaling": {"max_servers": 4}, "serving": {"emulated_cores": 1}})
-
-    assert PlatformSettings.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
-
-
-def test_replace_keeps_the_rest_of_a_group() -> None:
-    settings = PlatformSettings.from_dict({"scaling": {"max_servers": 4}})
-
-    changed = settings.replace(scaling={"min_servers": 3})
-
-    assert (changed.scaling.min_servers, changed.scaling.max_servers) == (3, 4)
-
-
-def test_replace_refuses_what_from_dict_refuses() -> None:
-    with pytest.raises(SettingsError, match="unknown group"):
-        PlatformSettings().replace(nonsense={"x": 1})
-    with pytest.raises(SettingsError, match="must be an object"):
-        PlatformSettings().replace(scaling=3)  # type: ignore[arg-type]
-
-
-def test_a_settings_file_holds_overrides_only(tmp_path: Path) -> None:
-    path = write(tmp_path, {"app": "python app.py", "context": {"rse-pf": {"scaling": {"max_servers": 4}}}})
-
-    assert load_settings(path).scaling.max_servers == 4
-
-
-def test_without_any_file_the_defaults_are_in_force(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    assert load_settings() == PlatformSettings()
-
-
-def test_the_file_of_the_working_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write(tmp_path, {"context": {"rse-pf": {"local": {"servers": 5}}}})
-    monkeypatch.chdir(tmp_path)
-
-    assert load_settings().local.servers == 5
-
-
-def test_a_cdk_file_without_our_context_is_fine(tmp_path: Path) -> None:
-    assert load_settings(write(tmp_path, {"app": "python app.py"})) == PlatformSettings()
-
-
 def test_settings_at_the_top_of_a_file_are_refused_instead_of_being_left_out(tmp_path: Path) -> None:
     file = write(tmp_path, {"serving": {"port": 1}, "session": {}})
 
@@ -213,13 +161,6 @@ def test_a_broken_file_is_a_settings_error_and_nothing_else(tmp_path: Path, data
         load_settings(path)
 
     assert caught.value.hint
-
-
-def test_a_named_file_that_is_missing_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="cannot read"):
-        load_settings(tmp_path / "nothing.json")
-    with pytest.raises(SettingsError, match="cannot read"):
-        load_settings(tmp_path)
 
 
 WORDS = st.sampled_from([row.group for row in ROWS]) | st.text(max_size=8)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rse_pf.data_server.fair_threads import FairThreads, check_wanted, while_wanted
+from rse_pf.data_server.fair_threads import FairThreads, while_wanted
 from rse_pf.errors import Disconnected
 from rse_pf.identity import RobotId
 
@@ -40,37 +40,6 @@ class Gate:
             assert await asyncio.to_thread(self.entered.acquire, timeout=TIMEOUT_S)
 
 
-async def test_the_result_and_the_error_of_the_work_are_those_of_the_call(threads: FairThreads) -> None:
-    assert await threads.run(ROBOT, divmod, 7, 2) == (3, 1)
-    with pytest.raises(ZeroDivisionError):
-        await threads.run(ROBOT, divmod, 7, 0)
-
-
-async def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads) -> None:
-    gate = Gate()
-
-    robots = [RobotId("acme", f"robot-{number % 12}") for number in range(96)]
-    flood = [asyncio.ensure_future(threads.run(robot, gate.work)) for robot in robots]
-    one = [asyncio.ensure_future(threads.run(OTHER, gate.work)) for _ in range(8)]
-    await gate.wait_entered(7)
-    assert not gate.entered.acquire(blocking=False), "of eight, six for the tenant, one for the other"
-    gate.open.set()
-    assert await asyncio.wait_for(asyncio.gather(*flood, *one), TIMEOUT_S) == ["done"] * 104
-
-
-async def test_a_tenant_never_has_all_of_a_few_threads() -> None:
-    gate, few = Gate(), FairThreads(3)
-
-    robots = [RobotId("acme", f"robot-{number}") for number in range(6)]
-    flood = [asyncio.ensure_future(few.run(robot, gate.work)) for robot in robots]
-    await gate.wait_entered(2)
-    assert await asyncio.wait_for(few.run(OTHER, int, "5"), TIMEOUT_S) == 5
-    assert not gate.entered.acquire(blocking=False)
-    gate.open.set()
-    await asyncio.wait_for(asyncio.gather(*flood), TIMEOUT_S)
-    few.close()
-
-
 async def test_two_tenants_never_have_all_of_a_few_threads() -> None:
     gate, few = Gate(), FairThreads(3)
 
@@ -93,21 +62,6 @@ async def test_a_robot_is_served_beside_the_flood_of_another(threads: FairThread
     assert not gate.entered.acquire(blocking=False)
     gate.open.set()
     await asyncio.wait_for(asyncio.gather(*work), TIMEOUT_S)
-
-
-async def test_tenants_are_served_in_turn_and_then_their_robots() -> None:
-    threads, gate = FairThreads(1), Gate()
-    order: list[str] = []
-
-    first = asyncio.ensure_future(threads.run(OTHER, gate.work))
-    await gate.wait_entered()
-    robots = [RobotId("acme", name) for name in "aaaabb"] + [RobotId("rival", "c")]
-    later = [asyncio.ensure_future(threads.run(robot, order.append, robot.name)) for robot in robots]
-    await asyncio.sleep(0)
-    gate.open.set()
-    await asyncio.wait_for(asyncio.gather(first, *later), TIMEOUT_S)
-    threads.close()
-    assert order == ["a", "c", "b", "a", "b", "a", "a"]
 
 
 async def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_step() -> None:
@@ -136,7 +90,3 @@ async def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_st
     assert await asyncio.wait_for(threads.run(OTHER, int, "1"), TIMEOUT_S) == 1
     threads.close()
     assert steps == [0]
-
-
-def test_work_outside_of_a_request_is_always_wanted() -> None:
-    check_wanted()

@@ -63,24 +63,6 @@ def test_another_server_continues_the_file_and_judges_all_of_it(
     assert service.ask("GET", OBJECT).body == DATA
 
 
-def test_bytes_that_another_server_wrote_are_judged_too(service: Service, store: DirectoryStore) -> None:
-    part(service, 0, 4096)
-    store.append(PART, 4096, b"x" * 4096)  # by another server; this one knows a hash of the first part
-
-    assert part(service, 8192, 10_000).status == 400
-    assert list(store.list("objects/")) == list(store.list("uploads/")) == []
-
-
-def test_an_upload_that_another_server_ended_is_judged_by_what_is_stored(
-    service: Service, store: DirectoryStore
-) -> None:
-    part(service, 0, 4096)
-    store.append(PART, 4096, DATA[4096:])  # by another server, which was then killed
-
-    assert service.ask("HEAD", UPLOAD).headers["upload-offset"] == "10000"
-    assert service.ask("GET", OBJECT).body == DATA
-
-
 def test_an_upload_goes_on_behind_a_part_of_which_a_half_was_written(
     service: Service, store: DirectoryStore
 ) -> None:
@@ -107,14 +89,6 @@ def test_an_upload_is_complete_whose_server_ended_when_the_object_had_its_name(
     assert service.ask("GET", OBJECT).body == DATA
 
 
-def test_parts_of_an_earlier_version_are_assembled(service: Service, store: DirectoryStore) -> None:
-    store.put(PART, DATA[:4096])
-    store.put(PART.replace(f"{0:015d}", f"{4096:015d}"), DATA[4096:8192])
-
-    assert part(service, 8192, 10_000).status == 201
-    assert service.ask("GET", OBJECT).body == DATA
-
-
 def test_only_one_writer_extends_a_file_and_nobody_after_it_became_an_object(store: DirectoryStore) -> None:
     store.append("uploads/a", 0, b"ab")
     with open(store._path("uploads/a"), "rb") as other:
@@ -136,36 +110,3 @@ def test_only_one_writer_extends_a_file_and_nobody_after_it_became_an_object(sto
     with pytest.raises(NotFound):
         store.adopt("objects/b", "uploads/a", 3)
     assert store.get("objects/a") == b"abc"
-
-
-def test_a_full_disk_leaves_the_file_as_it_was(
-    store: DirectoryStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store.append("uploads/a", 0, b"ab")
-    write = os.pwrite
-
-    def fills(handle: int, data: bytes, at: int) -> int:
-        if at > 2:
-            raise OSError(28, "full")
-        return write(handle, data[:1], at)
-
-    monkeypatch.setattr(os, "pwrite", fills)
-    with pytest.raises(Exception, match="no space"):
-        store.append("uploads/a", 2, b"cd")
-
-    assert store.get("uploads/a") == b"ab"
-
-
-def test_a_file_is_read_from_memory_as_it_is_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(DATA)
-    (tmp_path / "link").symlink_to(path)
-    (tmp_path / "empty").touch()
-    (tmp_path / "folder").mkdir()
-
-    store = DirectoryStore(tmp_path)
-    for start, length in ((0, 10_000), (0, 0), (9_000, 5000), (10_001, 5)):
-        found = store.get_cached("a", start, length)
-        assert found in ((10_000, DATA[start : start + length]), None), "a kernel may not know"
-    assert [store.get_cached(name, 0, 10) for name in ("link", "missing", "folder")] == [None] * 3
-    assert store.get_cached("empty", 0, 10) == (0, b"")

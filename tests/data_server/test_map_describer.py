@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,16 +9,13 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.map_describer import TARGET, MapDescriber
 from rse_pf.data_server.robot_processes import RobotProcesses
-from rse_pf.errors import Busy, Crashed, RsePfError
+from rse_pf.errors import Busy, Crashed
 from rse_pf.identity import RobotId
 from rse_pf.limits.crash_record import BLOCK_S
-from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.storage.object_store import DirectoryStore, MemoryStore
-from tests.kit.fake_data_service import small_settings
+from rse_pf.storage.object_store import MemoryStore
 
 ROBOT, OTHER = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
-EMPTY = MapSummary(keyframes=0, edges=0, points=0, robots=())
 MAP = encode_map(MapVersion(keyframes=()))
 
 
@@ -34,36 +29,6 @@ class Clock:
 @pytest.fixture
 def clock() -> Clock:
     return Clock()
-
-
-@pytest.fixture
-def describer(tmp_path: Path, clock: Clock) -> Iterator[MapDescriber]:
-    """One for a store in a folder, which the process reads itself."""
-    settings = small_settings(store=f"dir:{tmp_path}", max_object_bytes=1 << 20)
-    made = MapDescriber(RobotProcesses(TARGET, settings, MemoryStore(), clock))
-    yield made
-    made.close()
-
-
-def test_the_process_reads_the_store_itself_and_counts(describer: MapDescriber, tmp_path: Path) -> None:
-    DirectoryStore(tmp_path).put("objects/acme/robot-1/a", MAP)
-
-    assert describer.describe(ROBOT, "objects/acme/robot-1/a") == EMPTY
-    with pytest.raises(RsePfError, match="no object"):
-        describer.describe(ROBOT, "objects/acme/robot-1/b")
-
-
-def test_a_store_in_memory_is_read_by_the_data_server(clock: Clock) -> None:
-    store = MemoryStore()
-    store.put("map", MAP)
-    store.put("none", b"x")
-    made = MapDescriber(RobotProcesses(TARGET, small_settings(), store, clock))
-    try:
-        assert made.describe(ROBOT, "map") == EMPTY
-        with pytest.raises(RsePfError):
-            made.describe(ROBOT, "none")
-    finally:
-        made.close()
 
 
 class Killed:

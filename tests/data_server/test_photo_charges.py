@@ -61,26 +61,6 @@ def test_who_used_its_cpu_time_is_refused_before_a_photo_is_read(data: bytes, st
     assert service.photo().status == 200
 
 
-def test_a_photo_never_counts_for_more_than_what_may_come_at_once() -> None:
-    localiser = Localiser()
-    service = PhotoService(small_settings(max_requests_per_s=50), MemoryStore(), localiser=localiser)
-    localiser.cpu_s = 20.0  # the first photo of a large map
-
-    assert service.photo().status == 200
-    service.now += 0.1
-    assert service.photo().status == 200
-    refused = service.photo()
-    assert int(refused.headers["retry-after"]) <= 5
-
-
-def test_photos_that_take_little_count_as_ten_requests() -> None:
-    localiser = Localiser()
-    service = PhotoService(small_settings(max_requests_per_s=50), MemoryStore(), localiser=localiser)
-    localiser.cpu_s = 0.03
-
-    assert [service.photo().status for _ in range(21)] == [200] * 20 + [429]
-
-
 class _BrokenProcesses:
     """Processes of which each takes 0.3 s of CPU time, and fails."""
 

@@ -44,17 +44,6 @@ def direct(bucket: Bucket) -> Service:
     return Service(small_settings(), bucket)
 
 
-def test_a_new_upload_gets_a_presigned_url(direct: Service, bucket: Bucket) -> None:
-    told = direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN).json
-
-    assert told["direct"]["url"] == f"https://bucket/{NAME}?signed"
-    assert told["direct"]["headers"] == {"Content-Length": str(len(DATA)), "x-checksum": DIGEST}
-    assert told["direct"]["life_s"] == PRESIGNED_URL_TTL_S
-    assert bucket.signed == [(NAME, len(DATA), DIGEST, PRESIGNED_URL_TTL_S)], (
-        "name, length and digest are fixed"
-    )
-
-
 def test_after_a_direct_upload_the_object_exists_and_the_upload_is_closed(
     direct: Service, bucket: Bucket
 ) -> None:
@@ -80,15 +69,6 @@ def test_an_object_counts_once_against_the_quota_however_it_was_uploaded(bucket:
     assert (same_again, one_more) == (200, 413)
 
 
-def test_an_upload_begun_in_parts_continues_in_parts(direct: Service) -> None:
-    direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN)
-    direct.ask("PATCH", f"/data/v1/uploads/{DIGEST}", DATA[:4096], headers={"Upload-Offset": "0"})
-
-    told = direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN).json
-
-    assert (told["offset"], told.get("direct")) == (4096, None)
-
-
 def test_a_refused_size_gets_no_url(direct: Service, bucket: Bucket) -> None:
     size = direct.settings.data.max_object_bytes + 1
 
@@ -109,14 +89,6 @@ def test_a_download_is_redirected_only_on_request_and_only_to_own_objects(
     assert direct.ask("GET", path).body == DATA
     foreign = direct.ask("GET", path, headers=asks, robot="robot-2")
     assert (foreign.status, "location" in foreign.headers) == (404, False)
-
-
-def test_a_store_without_presigned_urls_sends_the_bytes_itself(service: Service) -> None:
-    service.store.put(NAME, DATA)
-    other = digest_of(b"other")
-
-    assert service.ask("GET", f"/data/v1/objects/{DIGEST}", headers={"X-Accept-Direct": "1"}).body == DATA
-    assert service.ask("PUT", f"/data/v1/uploads/{other}", b'{"size": 5}').json.get("direct") is None
 
 
 def test_no_presigned_url_is_logged(direct: Service, bucket: Bucket) -> None:

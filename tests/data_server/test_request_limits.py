@@ -6,7 +6,7 @@ import pytest
 
 from rse_pf.config import DataSettings
 from rse_pf.data_server.http import HttpRequest, TooManyRequests
-from rse_pf.data_server.request_limits import MAX_REQUESTS_PER_ROBOT, RequestLimits
+from rse_pf.data_server.request_limits import RequestLimits
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 
@@ -48,42 +48,6 @@ def test_a_robot_beyond_its_rate_is_told_when_to_come_back_and_others_are_served
     ask(gate, ROBOT, now=0.1)
 
 
-def test_a_dear_request_counts_for_several() -> None:
-    gate = admission()
-    for _ in range(2):
-        ask(gate, ROBOT, now=0.0, cost=20.0)
-
-    with pytest.raises(TooManyRequests):
-        ask(gate, ROBOT, now=0.0)
-
-
-def test_the_body_of_a_refused_request_counts_for_several_and_is_paid_off_within_seconds() -> None:
-    gate = admission()
-    for _ in range(2):  # 1 MiB counts for 16 more, and 1 GiB for no more than 32
-        ask(gate, ROBOT, now=0.0)
-        gate.charge_refused(ROBOT, 1 << 20, now=0.0)
-    gate.charge_refused(ROBOT, 1 << 30, now=0.0)
-
-    with pytest.raises(TooManyRequests) as refused:
-        ask(gate, ROBOT, now=0.0)
-
-    assert refused.value.retry_after_ms == pytest.approx(2700.0)  # 40 - 2 - 2 x 16 - 32 = -26
-    ask(gate, OTHER, now=0.0)
-    ask(gate, ROBOT, now=2.7)
-
-
-def test_a_robot_has_a_limit_of_requests_in_progress() -> None:
-    gate = admission()
-    first, *_ = [begin(gate, ROBOT) for _ in range(MAX_REQUESTS_PER_ROBOT)]
-
-    with pytest.raises(TooManyRequests, match=f"{MAX_REQUESTS_PER_ROBOT} requests"):
-        begin(gate, ROBOT)
-
-    begin(gate, OTHER)
-    gate.end(first)
-    begin(gate, ROBOT)
-
-
 def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
     gate = admission(max_uploads=8)
     robots = [RobotId("acme", f"robot-{number}") for number in range(4)]
@@ -100,19 +64,6 @@ def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
         begin(gate, OTHER, body=True)
     gate.end(first)
     begin(gate, OTHER, body=True)
-
-
-def test_a_refused_body_takes_no_place_and_counts_for_the_rate() -> None:
-    gate = admission(max_uploads=4)
-    request = begin(gate, ROBOT, body=True)
-    for _ in range(38):
-        with pytest.raises(Busy, match="request bodies"):
-            begin(gate, ROBOT, body=True)
-    gate.end(request)
-
-    gate.end(begin(gate, ROBOT, body=True))
-    with pytest.raises(TooManyRequests, match="10 requests a second"):
-        begin(gate, ROBOT, body=True)
 
 
 def test_the_names_of_robots_that_come_and_go_take_no_memory() -> None:

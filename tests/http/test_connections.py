@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 
-from fuzz.http_twin import compare, disagreement
+from fuzz.http_twin import compare
 from rse_pf.http.connections import MAX_HEAD_BYTES, MAX_HEADERS
 from tests.kit.http_service import http_service
-from tests.kit.smuggling_samples import SAMPLES
 
 SOON_S = 30.0
 GET = b"GET /a HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -239,7 +238,3 @@ async def test_what_is_accepted_is_understood_alike_by_h11(seed: int) -> None:
 
     assert problems == []
     assert accepted > 0.08 * 5000, "samples that nobody accepts compare nothing"
-
-
-async def test_the_samples_of_smuggling_are_understood_alike_by_h11() -> None:
-    assert {name for name, data in SAMPLES.items() if (await disagreement(data, [data]))[1]} == set()

@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 import pytest
 
 from lambda_pnp.keys import KeyCache, signed_request
-from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster, public_key_of, to_json
+from rse_pf.auth.roster import DenyList, to_json
 from rse_pf.auth.tokens import Claims, SigningKey
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId
@@ -34,14 +34,6 @@ def test_the_signature_is_the_one_that_the_aws_sdk_makes(monkeypatch: pytest.Mon
     signer.add_auth(theirs)
 
     assert request.get_header("Authorization") == theirs.headers["Authorization"]
-
-
-def test_the_request_goes_to_the_bucket_by_tls() -> None:
-    request = signed_request(ENVIRONMENT, NOW)
-
-    assert request.full_url == "https://artifacts.s3.ap-northeast-2.amazonaws.com/keys.json"
-    assert request.get_header("X-amz-security-token") == "session"
-    assert "secret" not in str(request.header_items())
 
 
 class Bucket:
@@ -92,13 +84,6 @@ def test_an_unreachable_bucket_keeps_the_keys_and_is_retried_soon(
     assert keys.at(86_400.0).get("a") is not None, "as on servers, there is no limit in time"
 
 
-def test_before_the_first_key_every_token_is_refused(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert KeyCache(Bucket().read, 60.0).at(0.0).get("a") is None
-    assert "rse-pf token init --cloud" in capsys.readouterr().err
-
-
 class Room:
     """A access control store whose objects may be there, missing, or out of reach."""
 
@@ -147,18 +132,3 @@ def test_every_token_is_refused_while_the_deny_list_was_never_read() -> None:
     room.error = OSError("HTTP Error 403: Forbidden")
 
     assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).get("a") is None
-
-
-def test_an_enrolled_robots_key_is_known() -> None:
-    key = SigningKey.of_robot(b"r" * 32)
-    robot = EnrolledRobot(robot="r", x=public_key_of(key.public_json()))
-    room = Room()
-    room.objects["robots.json"] = to_json(Roster(robots=(robot,))).decode()
-
-    assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).robot_of(key.key_id) == robot
-
-
-def test_roster_and_deny_list_lie_beside_the_keys() -> None:
-    request = signed_request(ENVIRONMENT, NOW, "deny.json")
-
-    assert request.full_url == "https://artifacts.s3.ap-northeast-2.amazonaws.com/control/deny.json"

@@ -69,14 +69,6 @@ def test_a_message_is_refused_exactly_when_what_it_holds_weighs_too_much(value):
         assert not too_much or len(data) <= SMALL.values // MAP_VALUES
 
 
-@given(data=st.binary(max_size=500))
-def test_counting_ends_for_bytes_that_are_not_messagepack(data):
-    try:
-        check_msgpack(data, SMALL)
-    except (LimitExceeded, BadMessage):
-        assert len(data) > SMALL.values // MAP_VALUES
-
-
 @pytest.mark.parametrize(
     "unit",
     [b"\x90", b"\x80", b"\xe0", b"\xd0\x80", b"\xa1z", b"\xd9\x01z", b"\xc4\x00", b"\xcb" + b"\x3f" * 8],
@@ -86,14 +78,6 @@ def test_every_kind_of_small_value_has_its_limit(unit):
 
     with pytest.raises(LimitExceeded):
         check_msgpack(array_of(unit, 1001), limits)
-
-
-def test_raw_arrays_of_the_largest_message_are_two_values():
-    codec = make_codec("bin")
-    data = codec.encode(Command(id=1, service="pnp", payload=np.random.default_rng(3).random(32000)))
-
-    check_msgpack(data, SMALL)
-    assert codec.decode_from_robot(data).id == 1
 
 
 @pytest.mark.parametrize("codec", ["json", "bin"])
@@ -108,18 +92,7 @@ def test_numbers_have_a_limit_in_every_codec(codec, monkeypatch):
         speak.decode_from_robot(speak.encode(too_many))
 
 
-def test_marks_within_a_word_are_no_values(monkeypatch):
-    monkeypatch.setattr("rse_pf.limits.budget.MESSAGE_VALUES", 2000)
-    codec = make_codec("json")
-    text = ',:[{"\\' * 20000
-
-    decoded = codec.decode_from_robot(codec.encode(Command(id=1, service="echo", payload=text)))
-
-    assert decoded.payload == text
-
-
 LONG_NUMBERS = ("1" * 20, "12345678901234567890.5e-30", "0." + "0" * 30 + "1" * 20, "-1." + "0" * 19)
-SHORT_NUMBERS = ("0.00012345678901234567", "-1.2345678901234567e-05", "1" * 19, "5e-99", "0." + "0" * 60)
 
 
 def is_within(text: str) -> bool:
@@ -138,11 +111,6 @@ def test_few_numbers_may_have_more_than_19_digits(number):
     assert is_within(numbers(400))
     assert not is_within(numbers(401))
     assert is_within('["' + numbers(1000) + '", "' + "x" * 9000 + '"]'), "it is a text"
-
-
-@pytest.mark.parametrize("number", SHORT_NUMBERS)
-def test_many_numbers_may_have_19_digits(number):
-    assert is_within("[" + f"{number}," * 10_000 + "1]")
 
 
 @pytest.mark.parametrize("number", ["5e-324", "1.7E308", "0.1e+0100"])
@@ -180,15 +148,6 @@ def test_a_list_that_is_too_deep_for_the_decoder_is_refused(depth):
         check_msgpack(b"\x91" * depth + b"\x01" * 1000, WIDE)
 
 
-@pytest.mark.parametrize("numbers", [[1.5] * 9000, [7] * 9000, [-3000] * 9000, list(range(128)) * 70])
-def test_a_flat_list_of_one_kind_may_be_longer_than_mixed_values(numbers):
-    assert check_msgpack(msgspec.msgpack.encode(numbers), WIDE)
-    with pytest.raises(LimitExceeded, match="more than 2000 values"):
-        check_msgpack(msgspec.msgpack.encode([*numbers, "a"]), WIDE)
-    with pytest.raises(LimitExceeded, match="more than 100000 values"):
-        check_msgpack(msgspec.msgpack.encode([numbers] * 12), WIDE)
-
-
 @given(value=values)
 def test_a_value_within_a_message_is_measured_to_its_last_byte(value):
     data = msgspec.msgpack.encode(value)
@@ -212,31 +171,6 @@ def test_a_length_past_the_end_of_the_data_is_a_bad_message(data):
         check_msgpack(b"\x92" + msgspec.msgpack.encode(LONG) + data, WIDE)
 
 
-def test_bytes_after_a_message_are_a_bad_message():
-    with pytest.raises(BadMessage, match="follow"):
-        check_msgpack(msgspec.msgpack.encode(LONG) + b"\x01", WIDE)
-
-
-@pytest.mark.parametrize(
-    ("size", "is_allowed"), [(WIDE.free_bytes, True), (WIDE.free_bytes + 1, False), (1 << 24, False)]
-)
-def test_bytes_that_deflate_well_are_allowed_up_to_a_size(size, is_allowed):
-    data = zlib.compress(bytes(size))
-
-    if is_allowed:
-        assert inflate_within(data, WIDE) == bytes(size)
-        return
-    with pytest.raises(LimitExceeded):
-        inflate_within(data, WIDE)
-
-
-@pytest.mark.parametrize("size", [0, 1, 800, 820, 60_000, 70_000, 200_000, 1 << 20])
-def test_bytes_that_deflate_little_are_whole(size):
-    plain = np.random.default_rng(size).integers(0, 200, size, dtype=np.uint8).tobytes()
-
-    assert inflate_within(zlib.compress(plain), WIDE) == plain
-
-
 def test_inflating_refuses_what_is_not_one_stream():
     plain = np.random.default_rng(1).bytes(200_000)
     data = zlib.compress(plain)
@@ -246,18 +180,6 @@ def test_inflating_refuses_what_is_not_one_stream():
             inflate_within(wrong, WIDE)
     with pytest.raises(LimitExceeded):
         inflate_within(zlib.compress(np.random.default_rng(1).bytes((1 << 20) + 1)), WIDE)
-
-
-def test_bytes_that_deflate_well_are_refused_by_their_ratio_behind_others_that_do_not():
-    noise = np.random.default_rng(3).bytes(1500)
-    for zeros, is_allowed in ((25_000, True), (40_000, False), (1 << 19, False)):
-        data = zlib.compress(noise + bytes(zeros), 9)
-        assert (len(noise) + zeros <= len(data) * WIDE.inflate_ratio) == is_allowed
-        if is_allowed:
-            assert inflate_within(data, WIDE) == noise + bytes(zeros)
-            continue
-        with pytest.raises(LimitExceeded):
-            inflate_within(data, WIDE)
 
 
 def test_bytes_after_a_stream_are_seen_wherever_it_ends():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rse_pf.identity import RobotId
-from rse_pf.limits.crash_record import BLOCK_S, WINDOW_S, CrashRecord
+from rse_pf.limits.crash_record import BLOCK_S, CrashRecord
 
 ALICE, NAMESAKE = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 
@@ -18,22 +18,6 @@ def test_the_second_crash_keeps_a_robot_out_for_a_while():
     assert refusal is not None
     assert refusal.retry_after_ms == BLOCK_S * 1e3
     assert record.refusal(ALICE, 1.0 + BLOCK_S) is None
-
-
-def test_a_robot_of_that_name_in_another_tenant_is_not_kept_out():
-    record = CrashRecord()
-    record.note_crash(ALICE, 0.0)
-
-    assert not record.note_crash(NAMESAKE, 0.0)
-    assert record.note_crash(ALICE, 0.0)
-    assert record.refusal(NAMESAKE, 0.0) is None
-    assert record.blocked(20.0) == [(ALICE, BLOCK_S - 20.0)]
-
-
-def test_crashes_that_lie_far_apart_do_not_count_together():
-    record = CrashRecord()
-
-    assert not any(record.note_crash(ALICE, number * (WINDOW_S + 1.0)) for number in range(5))
 
 
 def test_after_its_rest_a_robot_needs_as_many_crashes_again():

@@ -50,26 +50,6 @@ def test_the_least_recently_served_tenant_goes_first_and_there_the_least_recentl
     assert len(queue) == 0
 
 
-def test_the_items_of_a_robot_keep_their_order():
-    queue: FairQueue[int] = FairQueue()
-    for number in range(3):
-        queue.add(robot_of("a"), number)
-
-    assert [queue.take() for _ in range(4)] == [0, 1, 2, None]
-
-
-def test_a_robot_that_joins_waits_for_one_item_of_each_other():
-    queue: FairQueue[str] = FairQueue()
-    for number in range(9):
-        queue.add(robot_of("a"), f"a:{number}")
-        queue.add(robot_of("b"), f"b:{number}")
-    assert served(queue, 5) == "ababa"
-    for number in range(3):
-        queue.add(robot_of("c"), f"c:{number}")
-
-    assert served(queue, 6) == "bacbac"
-
-
 @pytest.mark.parametrize(
     ("limits", "running"),
     [
@@ -101,18 +81,6 @@ def test_the_tenant_with_the_fewest_running_items_goes_before_one_that_waits_for
     queue.add(robot_of("y/2"), "y1")
 
     assert [queue.take(), queue.take(), queue.take()] == ["y0", "y1", "x2"]
-
-
-def test_removed_items_cost_their_robot_no_turn():
-    queue: FairQueue[str] = FairQueue()
-    for number in range(3):
-        queue.add(robot_of("a"), f"a:{number}")
-    assert queue.remove(lambda item: item in ("a:0", "a:1")) == ["a:0", "a:1"]
-    assert queue.remove(lambda item: item == "a:0") == []
-    queue.add(robot_of("b"), "b:0")
-
-    assert queue.peek() == "a:2"
-    assert served(queue, 2) == "ab"
 
 
 @given(st.lists(st.sampled_from(["x/1", "x/2", "y/1"]), max_size=30))

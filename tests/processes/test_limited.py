@@ -156,21 +156,6 @@ def beside(call: Callable[[], object], error: type[RsePfError]) -> Iterator[thre
     assert len(raised) == 1
 
 
-def test_nothing_is_started_before_the_first_call(own: LimitedProcesses):
-    assert own.pids() == []
-
-    assert own.call(b"configuration", LONG_S) == b"chosen"
-    assert len(own.pids()) == 2
-
-
-def test_one_process_answers_one_call_after_the_other(processes: LimitedProcesses):
-    pids = {processes.call(b"pid", LONG_S) for _ in range(20)}
-    size = processes.call(b"size " + bytes(5 << 20), LONG_S)
-
-    assert len(pids) == 1
-    assert int(size) == 5 << 20
-
-
 def test_a_call_gets_the_process_that_had_one_like_it(handler: str):
     with made_of(handler, count=2) as made:
         first = int(made.call(b"pid", LONG_S))
@@ -256,15 +241,6 @@ def test_a_call_that_sleeps_is_killed_at_its_timeout(processes: LimitedProcesses
     assert state_of(pid) == ""
 
 
-def test_a_timeout_tells_the_cpu_time_of_its_own_call_alone(processes: LimitedProcesses):
-    processes.call(b"burn 0.2", LONG_S)
-
-    with pytest.raises(Overran) as raised:
-        processes.call(b"loop", 0.1)
-
-    assert 0.0 < raised.value.cpu_s < 0.15
-
-
 def test_what_the_handler_refuses_arrives_with_its_hint(processes: LimitedProcesses):
     pid = processes.call(b"pid", LONG_S)
 
@@ -302,14 +278,6 @@ def test_what_libraries_print_does_not_reach_the_log(
     assert "Traceback" in log.err
 
 
-def test_what_others_left_in_a_process_does_not_end_a_call(processes: LimitedProcesses):
-    processes.call(b"keep 40000000", LONG_S)
-    first = processes.call(b"pid", LONG_S)
-
-    assert processes.call(b"keep 40000000", LONG_S) == b"done"
-    assert processes.call(b"pid", LONG_S) != first
-
-
 def test_a_hundred_kills_leave_no_process_and_no_descriptor(processes: LimitedProcesses):
     processes.call(b"", LONG_S)
     template = processes.pids()[0]
@@ -329,30 +297,6 @@ def test_a_hundred_kills_leave_no_process_and_no_descriptor(processes: LimitedPr
     assert len(processes.pids()) == 2
 
 
-def test_several_threads_share_the_processes(handler: str):
-    with made_of(handler, count=2) as processes:
-        processes.call(b"", LONG_S)
-        with beside(lambda: processes.call(b"sleep", 0.5), Expired):
-            answers = [processes.call(b"", LONG_S) for _ in range(50)]
-
-    assert answers == [b"done"] * 50
-
-
-def test_a_process_that_ended_keeps_its_pid_until_its_place_is_needed(handler: str):
-    with made_of(handler, count=2) as processes:
-        ended = int(processes.call(b"pid", LONG_S, near="a"))
-        other = int(processes.call(b"pid", LONG_S, near="b"))
-        os.kill(ended, 9)
-        assert has_ended(ended)
-        with pytest.raises(Crashed):  # the template kills and forks meanwhile
-            processes.call(b"signal 9", LONG_S, near="b")
-
-        assert ended != other
-        assert state_of(ended) == "Z"
-        assert processes.call(b"", LONG_S, near="a") == b"done"
-        assert state_of(ended) == ""
-
-
 def test_without_a_free_process_in_time_a_call_is_busy(processes: LimitedProcesses):
     processes.call(b"", LONG_S)
     refused: list[RsePfError] = []
@@ -364,28 +308,6 @@ def test_without_a_free_process_in_time_a_call_is_busy(processes: LimitedProcess
                 refused.append(error)
 
     assert any(isinstance(error, Busy) for error in refused)
-
-
-def test_a_template_that_ended_is_replaced(own: LimitedProcesses):
-    own.call(b"", LONG_S)
-    template, child = own.pids()
-    os.kill(template, 9)
-
-    assert has_ended(child)
-    with pytest.raises(WorkerLost):
-        own.call(b"", LONG_S)
-    assert own.call(b"", LONG_S) == b"done"
-    assert state_of(template) == ""
-    assert template not in own.pids()
-
-
-def test_a_target_that_cannot_start_is_no_fault_of_the_bytes(handler: str):
-    with LimitedProcesses("handled_in_tests:broken", ProcessLimits(memory_bytes=MEMORY_BYTES)) as processes:
-        for _ in range(2):
-            with pytest.raises(WorkerLost, match="cannot be started"):
-                processes.call(b"", LONG_S)
-
-        assert processes.pids() == []
 
 
 def test_closing_ends_all_processes_and_the_calls_that_are_under_way(own: LimitedProcesses):

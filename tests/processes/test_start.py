@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -50,11 +48,6 @@ def test_a_child_has_its_name_its_limits_and_one_socket() -> None:
     }  # fmt: skip
 
 
-def test_an_import_at_a_lower_priority_leaves_the_child_at_that_of_its_parent() -> None:
-    with child(import_nice=5) as started:
-        assert told(started)["nice"] == os.nice(0)
-
-
 def test_a_child_with_an_environment_of_its_own_has_nothing_of_its_parents(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -73,25 +66,6 @@ def test_the_signals_of_a_terminal_are_ignored_and_the_end_of_the_socket_ends_a_
         assert started.exit_code() is None
 
         assert started.end(WITHIN_S) == 0
-
-
-def test_a_child_that_does_not_end_is_killed_and_reaped() -> None:
-    with child("stay") as started:
-        receive(started.connection)
-        code = started.end(0.01)
-
-        assert how_ended(code) == "signal SIGKILL"
-        assert not Path(f"/proc/{started.pid}").exists()
-
-
-def test_a_child_ends_with_the_process_that_started_it() -> None:
-    with child("nest") as started:
-        pid = receive(started.connection, time.monotonic() + WITHIN_S)
-        handle = os.pidfd_open(pid)
-        started.kill()
-
-        assert select.select([handle], [], [], WITHIN_S)[0] == [handle]
-        os.close(handle)
 
 
 def test_a_fork_that_must_not_begin_is_killed_with_the_reason_and_others_on_order() -> None:
@@ -116,16 +90,6 @@ def test_a_fork_that_must_not_begin_is_killed_with_the_reason_and_others_on_orde
         assert report() == {"event": "gone", "id": 1, "how": "signal SIGKILL"}
     finally:
         assert server.end(WITHIN_S) == 0
-
-
-def test_a_message_to_a_child_that_has_ended_is_lost() -> None:
-    with child("stay") as started:
-        receive(started.connection)
-        os.kill(started.pid, signal.SIGKILL)
-        assert started.wait() == -signal.SIGKILL
-
-        started.say("tell")
-        assert receive(started.connection) is None
 
 
 @pytest.mark.parametrize(

@@ -61,19 +61,3 @@ async def test_a_malformed_message_is_answered_and_does_not_end_the_connection(
         await client.send(subscribe(), publish("alive"))
 
         assert await client.data() == ["alive"]
-
-
-async def test_a_message_that_can_be_read_in_part_is_refused_with_its_id(server: GuardedServer) -> None:
-    async with opened(server) as bridge:
-        client = await bridge.client()
-
-        assert (await client.ask('{"op":"subscribe","topic":5,"id":"s:9"}'))["id"] == "s:9"
-        assert (await client.ask('{"op":"publish","topic":"/x","id":"p:1"}'))["id"] == "p:1"
-
-
-async def test_a_status_below_the_level_is_not_sent(server: GuardedServer) -> None:
-    async with opened(server) as bridge:
-        client = await bridge.client()
-        await client.send({"op": "set_level", "level": "none"}, {"op": "png", "data": ""})
-
-        assert await client.settle() is None

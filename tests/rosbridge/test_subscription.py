@@ -5,16 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.extensions.rosbridge import subscription as subscriptions
-from rse_pf.extensions.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
-
-
-def test_what_waits_for_one_subscription_is_bounded_in_number_and_bytes() -> None:
-    small, large = Subscription("/small", HeldBytes()), Subscription("/large", HeldBytes())
-    for _ in range(2 * MAX_QUEUE_LENGTH):
-        small.put(TopicMessage(b"1"))
-        large.put(TopicMessage(bytes(200_000)))
-
-    assert (len(small), len(large)) == (MAX_QUEUE_LENGTH, 5)
+from rse_pf.extensions.rosbridge.subscription import HeldBytes, Subscription, TopicMessage
 
 
 def test_what_waits_for_all_subscribers_of_a_tenant_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

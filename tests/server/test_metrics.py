@@ -24,21 +24,6 @@ def worker(answers: list[tuple[str, str, float]], **gauges: float) -> dict:
     return metrics.snapshot()
 
 
-def test_counts_of_workers_are_added_and_ages_are_the_longest():
-    merged = merge(
-        [
-            worker([("pnp", "ok", 0.003), ("pnp", "busy", 0.0)], queue_oldest_s=0.2),
-            worker([("pnp", "ok", 0.03), ("icp", "ok", 9.0)], queue_oldest_s=0.1),
-        ]
-    )
-
-    assert sorted(merged["requests"]) == [["icp", "ok", 1], ["pnp", "busy", 1], ["pnp", "ok", 2]]
-    assert merged["gauges"]["robots"] == 4.0
-    assert merged["gauges"]["queue_oldest_s"] == 0.2
-    assert merged["shed"] == {"behind": 2}
-    assert merged["bytes"] == {"in": 20, "out": 0}
-
-
 def test_prometheus_can_parse_the_rendered_text():
     text = render(
         merge([worker([("pnp", "ok", 0.001), ("pnp", "ok", 0.0011), ("pnp", "ok", 60.0)])])
@@ -52,10 +37,6 @@ def test_prometheus_can_parse_the_rendered_text():
     }
     assert (buckets["0.001"], buckets["0.002"], buckets["5.0"], buckets["+Inf"]) == (1, 2, 2, 3)
     assert [s.value for s in families["rse_pf_shed"].samples if s.name == "rse_pf_shed_total"] == [1]
-
-
-def test_a_server_without_workers_that_answered_can_be_rendered():
-    assert b"rse_pf_requests" in render(merge([]))
 
 
 def test_what_was_computed_for_each_tenant_is_added_up_over_workers_and_kinds():

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.config import DataSettings, PlatformSettings
+from rse_pf.config import DataSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
-from rse_pf.server.jobs.process import JobRequest, store_reply
 from rse_pf.server.object_refs import ObjectRefs
 from rse_pf.server.robot_store import store_within_quota
 from rse_pf.storage.charges import charge_name
-from rse_pf.storage.object_store import DirectoryStore, MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore
 from rse_pf.storage.quotas import Accounts
 from rse_pf.wire import Failure, Result
 
 ROBOT = RobotId("default", "robot-1")
-REPLY = msgspec.msgpack.encode({"value": bytes(600)})
 
 
 def claims(**quotas: float) -> Claims:
@@ -29,18 +26,6 @@ def claims(**quotas: float) -> Claims:
 
 def accounts(store: MemoryStore) -> Accounts:
     return Accounts(store, DataSettings())
-
-
-REQUEST = JobRequest(service="long", payload={}, robot=ROBOT, key="k", quota_bytes=4100.0)
-
-
-def of(store: str, max_message_bytes: int = 2000) -> PlatformSettings:
-    return PlatformSettings.from_dict(
-        {
-            "data": {"store": store, "max_object_bytes": 4900},
-            "session": {"max_message_bytes": max_message_bytes},
-        }
-    )
 
 
 def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():
@@ -83,27 +68,3 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     assert (refused.id, refused.code) == (1, "quota")
     assert isinstance(stored, Result)
     assert [info.name for info in store.list("objects/")] == [object_name(ROBOT, stored.object)]
-
-
-def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_path):
-    small = store_reply(["done", 5.0, REPLY], REQUEST, of(f"dir:{tmp_path}"))
-    large = store_reply(["done", 5.0, REPLY], REQUEST, of(f"dir:{tmp_path}", max_message_bytes=1024))
-
-    assert small == ["stored", 5.0, digest_of(REPLY), len(REPLY), REPLY]
-    assert large == ["stored", 5.0, digest_of(REPLY), len(REPLY), None]
-    assert DirectoryStore(tmp_path).get(object_name(ROBOT, digest_of(REPLY))) == REPLY
-
-
-def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):
-    settings = of(f"dir:{tmp_path}")
-
-    assert store_reply(["done", 5.0, bytes(5000)], REQUEST, settings)[:2] == ["failed", "too-large"]
-    assert store_reply(["done", 5.0, bytes(4101)], REQUEST, settings)[:2] == ["failed", "quota"]
-    assert list(DirectoryStore(tmp_path).list()) == []
-
-
-def test_a_store_of_the_worker_alone_and_a_failure_are_left_to_the_worker():
-    failed = ["failed", "c", "m", "h"]
-
-    assert store_reply(["done", 5.0, REPLY], REQUEST, of("memory:")) == ["done", 5.0, REPLY]
-    assert store_reply(failed, REQUEST, of("memory:")) == failed

@@ -53,11 +53,6 @@ def _request(codec: str = "json", **changes: Any) -> PnpRequest:
     return make_request(points, pixels, KINECT, **given)
 
 
-def _flat(array: Array) -> list[float]:
-    numbers: list[float] = array.ravel().tolist()
-    return numbers
-
-
 def _pose(reply: PnpReply | Failure) -> Array:
     assert isinstance(reply, PnpReply), reply
     return reply.solution().T_camera_world
@@ -93,30 +88,6 @@ def test_a_request_without_depths_is_the_same_bytes_as_before(codec: str) -> Non
     )
 
 
-@pytest.mark.parametrize("depths_m", [None, [0.0] * 60])
-def test_no_depth_at_all_is_the_answer_without_the_field(depths_m: Any) -> None:
-    plain = msgspec.to_builtins(_request(depths_m=None), enc_hook=_flat)
-
-    without, with_none = _answer(plain), _answer(plain | {"depths_m": depths_m})
-
-    assert _pose(without).tobytes() == _pose(with_none).tobytes()
-
-
-def test_depths_travel_in_steps_of_a_millimetre() -> None:
-    request = _request()
-
-    assert request.depths_m is not None
-    assert request.depths_m is not msgspec.UNSET
-    np.testing.assert_array_equal(request.depths_m, np.round(request.depths_m, 3))
-
-
-def test_the_noise_of_the_sensor_comes_with_the_request() -> None:
-    default, noisy = _answer(_request()), _answer(_request(depth_noise=DepthNoise(base_m=0.1)))
-
-    assert _pose(default).tobytes() != _pose(noisy).tobytes()
-    assert _pose(default).tobytes() == _pose(_answer(_request(depth_noise=DepthNoise()))).tobytes()
-
-
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize(
     "depths_m", [np.ones(59), np.ones(0), np.full(60, -1.0), np.full(60, 1e9)],
@@ -129,15 +100,6 @@ def test_depths_that_do_not_fit_are_a_bad_request(codec: str, depths_m: Array) -
     assert found.code == "bad-request"
     assert "depths_m" in found.message
     assert found.hint
-
-
-def test_noise_out_of_range_is_a_typed_failure() -> None:
-    plain = msgspec.to_builtins(_request(), enc_hook=_flat)
-
-    found = _answer(plain | {"depth_noise": {"base_m": -1.0}})
-
-    assert isinstance(found, Failure)
-    assert "base_m" in found.message
 
 
 def test_no_finite_numbers_make_the_service_fail() -> None:

@@ -87,16 +87,3 @@ def test_a_secret_that_others_may_read_or_write_is_refused(tmp_path: Path, mode:
         read_private_file(tmp_path / "key", "the key", hint="make one")
 
     assert told.value.hint == f"chmod 600 {tmp_path / 'key'}"
-
-
-def test_a_missing_secret_is_refused_with_the_callers_hint(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"cannot read the key .*: No such file") as told:
-        read_private_file(tmp_path / "key", "the key", hint="make one")
-
-    assert told.value.hint == "make one"
-
-
-def test_a_pipe_in_the_place_of_a_secret_reads_as_empty(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe", 0o600)
-
-    assert read_private_file(tmp_path / "pipe", "the key", hint="make one") == b""

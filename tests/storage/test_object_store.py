@@ -31,7 +31,6 @@ from rse_pf.storage.object_store import (
     ObjectStore,
     Usage,
     _is_no_folder,
-    check_name,
     digest_of,
     open_store,
 )
@@ -81,42 +80,6 @@ def test_a_piece_is_read_where_it_lies_and_ends_where_the_object_does(store: Obj
     assert pieces == [b"0123", b"89", b"", b""]
     with pytest.raises(NotFound):
         store.get_range("b", 0, 1)
-
-
-def test_an_empty_object_is_an_object(store: ObjectStore) -> None:
-    store.put("empty", b"")
-
-    assert store.get("empty") == b""
-    assert names(store) == ["empty"]
-
-
-def test_a_second_put_replaces_the_first(store: ObjectStore) -> None:
-    store.put("a", b"a long first version")
-    store.put("a", b"second")
-
-    assert store.get("a") == b"second"
-
-
-def test_what_was_never_put_is_not_found(store: ObjectStore) -> None:
-    store.put("folder/object", b"x")
-
-    for missing in ("nothing", "folder", "folder/other", "folder/object/below"):
-        with pytest.raises(NotFound):
-            store.get(missing)
-        with pytest.raises(NotFound):
-            store.head(missing)
-        store.delete(missing)
-    assert names(store) == ["folder/object"]
-
-
-def test_a_deleted_object_is_gone(store: ObjectStore) -> None:
-    store.put("a", b"x")
-
-    store.delete("a")
-    store.delete("a")
-
-    with pytest.raises(NotFound):
-        store.get("a")
 
 
 def test_names_are_listed_in_order_and_by_prefix(store: ObjectStore) -> None:
@@ -495,13 +458,6 @@ def test_no_swap_is_lost_between_processes(tmp_path: Path) -> None:
     assert store.get("counter") == b"150"
 
 
-def test_a_location_names_its_store(tmp_path: Path) -> None:
-    assert isinstance(open_store("memory:"), MemoryStore)
-    directory = open_store(f"dir:{tmp_path}")
-    directory.put("a", b"x")
-    assert (tmp_path / "a").read_bytes() == b"x"
-
-
 @pytest.mark.parametrize("location", ["", "dir:", "ftp:x", "dir"])
 def test_a_location_without_a_store_is_a_usage_error(location: str) -> None:
     with pytest.raises(UsageError, match="is not a store"):
@@ -515,13 +471,6 @@ def test_a_kind_that_the_caller_can_open_is_opened() -> None:
     for location in ("s3:maps", "s3:"):
         with pytest.raises(UsageError, match="is not a store"):
             open_store(location)
-
-
-def test_a_digest_is_a_name() -> None:
-    digest = digest_of(b"abc")
-
-    assert digest == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert check_name(digest) == digest
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.config import DataSettings
-from rse_pf.errors import NotFound, QuotaExceeded, StoreFull
+from rse_pf.errors import QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore, charge_of, digest_of
@@ -151,23 +151,6 @@ def test_who_deletes_may_write_again_in_this_process_at_once_and_in_others_soon(
     account(store, clock, MIB).reserve(900_000)
 
 
-def test_a_write_that_fails_is_not_charged() -> None:
-    store, clock = MemoryStore(), Clock()
-    accounts = Accounts(store, DataSettings(tenant_quota_bytes=MIB), wall_clock=clock)
-    for _ in range(50):
-        with pytest.raises(StoreFull), accounts.reservation(RobotId("acme", "r"), 500_000):
-            raise StoreFull("no space")
-
-
-def test_a_damaged_account_is_counted_anew() -> None:
-    store, clock = MemoryStore(), Clock()
-    store.put("accounts/acme", b"no account")
-    store.put("objects/acme/r/1", bytes(MIB))
-
-    with pytest.raises(QuotaExceeded):
-        account(store, clock, MIB).reserve(1)
-
-
 def test_on_a_disk_that_fills_up_the_tenant_that_fills_it_is_refused_and_others_go_on(tmp_path: Path) -> None:
     store, clock = SmallDisk(tmp_path, 20 * MIB), Clock()
     filler, other = account(store, clock, 1 << 40), account(store, clock, 1 << 40, "rival")
@@ -186,11 +169,3 @@ def test_on_a_disk_that_fills_up_the_tenant_that_fills_it_is_refused_and_others_
     clock.now_s += 60.0
     with pytest.raises(StoreFull):
         filler.reserve(100_000)
-
-
-def test_a_folder_that_is_not_there_yet_has_the_space_of_its_disk(tmp_path: Path) -> None:
-    free, total = DirectoryStore(tmp_path / "later" / "store").space()
-
-    assert 0 < free <= total
-    with pytest.raises(NotFound):
-        DirectoryStore(tmp_path / "later").get("x")

@@ -15,7 +15,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, RsePfError
 from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import make_problem
-from rse_pf.service import Registry, dispatch
+from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpRequest, make_request
 from rse_pf.services.pnp_reader import pnp_reader
@@ -32,18 +32,6 @@ _TOKENS = (
     b"[", b"]", b"{", b'"', b"\\", b",", b"-", b"e", b"0", b"\xc7", b"e300", b"." + b"7" * 19,
 )  # fmt: skip
 _encode = msgspec.json.Encoder(enc_hook=json_encode_hook).encode
-
-
-class OwnRequest(msgspec.Struct):
-    """A request of a service that has the platform's name."""
-
-    camera: dict[str, float]
-
-
-class OwnReply(msgspec.Struct):
-    """Its reply."""
-
-    width: float
 
 
 def command_of(numbers: str, pixels: str = "1.5,2.5") -> bytes:
@@ -287,41 +275,6 @@ def test_a_reply_to_a_request_is_the_one_to_its_payload(codec: str) -> None:
         texts.append(zlib.decompress(data) if codec == "zlib" else data)
 
     assert texts[0] == texts[1]
-
-
-def test_a_server_with_a_pnp_of_its_own_gets_plain_payloads() -> None:
-    registry = Registry()
-
-    @registry.service("pnp")
-    def pnp(request: OwnRequest) -> OwnReply:
-        """Return the width."""
-        return OwnReply(request.camera["width"])
-
-    wire = make_server_codec("json", read_first=pnp_reader(registry, "json"))
-    command = wire.decode_from_robot(sample("json"))
-
-    assert isinstance(command, Command)
-    assert isinstance(command.payload, dict)
-    assert pnp_reader(Registry(), "json") is None
-
-
-@pytest.mark.parametrize("options", [{"kind": "per_robot_state"}, {"limited": True}])
-def test_what_runs_in_another_process_gets_plain_payloads(options: dict[str, Any]) -> None:
-    registry = Registry()
-
-    @registry.service("pnp", **options)
-    def pnp(request: PnpRequest) -> OwnReply:
-        """Return the width."""
-        return OwnReply(request.camera.width)
-
-    assert pnp_reader(registry, "json") is None
-
-
-def test_json_dumps_of_a_robot_without_the_sdk_is_read_at_once() -> None:
-    plain = json.dumps(json.loads(command_of("1,2.5,-3e-2"))).encode()
-
-    assert payload_type("json", plain) is PnpRequest
-    assert_alike("json", plain)
 
 
 @pytest.mark.parametrize("part", ["camera", "points_world", "pixels", "depths_m", "options", "depth_noise"])

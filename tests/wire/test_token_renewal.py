@@ -81,33 +81,6 @@ def test_a_renewal_is_due_after_four_fifths_of_the_ttl_and_then_more_often():
     assert min(b - a for a, b in itertools.pairwise(asked)) >= RENEWAL_PAUSE_S
 
 
-def test_after_a_renewal_the_next_one_is_due_in_the_new_ttl():
-    session, connection = linked(100.0)
-    session.receive(connection, CODEC.encode(Renewed(token_s=1000.0)), 80.0)
-
-    assert asked_at(session, connection, 1080)[:2] == [880, 980]
-
-
-def test_without_an_expiry_no_renewal_is_ever_due():
-    assert asked_at(*linked(None), 2000) == []
-
-
-def test_a_connection_that_is_being_left_is_not_renewed():
-    session, connection = linked(100.0)
-    connection.leaving = True
-
-    assert asked_at(session, connection, 100) == []
-
-
-def test_renew_writes_one_message():
-    session, connection = linked(100.0)
-    connection.outgoing.clear()
-
-    session.renew(connection, "fresh")
-
-    assert [CODEC.decode_from_robot(data) for data in connection.outgoing] == [Renew(token="fresh")]
-
-
 @pytest.mark.parametrize("absurd", [-1.0, 1e12])
 def test_an_implausible_expiry_counts_as_one_hour(absurd: float):
     timer = RenewalTimer()

@@ -73,29 +73,6 @@ def code_of(message: Result | Failure) -> str:
     return message.code if isinstance(message, Failure) else "ok"
 
 
-def test_a_reply_is_a_result_of_this_server(
-    worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
-):
-    processes.script = [reply_of(12.0, {"candidates": []})]
-
-    answer = limited.compute(place(worker))
-
-    assert answer == Result(id=7, reply={"candidates": []}, server="s-1", compute_ms=12.0)
-    assert processes.timeouts_s == [5.0]
-
-
-def test_a_failure_keeps_its_code_and_hint(
-    worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
-):
-    processes.script = [reply_of(0.0, None, ["bad-request", "no", "send less", 20.0])]
-
-    answer = limited.compute(place(worker))
-
-    assert answer == Failure(
-        id=7, code="bad-request", message="no", hint="send less", retry_after_ms=20.0, server="s-1", trace="t"
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("error", "code"),
     [
@@ -115,16 +92,6 @@ def test_only_crashes_are_evidence(
     assert codes == [code] * 5 + ["ok"]
 
 
-def test_long_work_that_ends_at_the_deadline_is_evidence_too(
-    worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
-):
-    processes.script = [Overran(5.0, 4.5)] * 2
-
-    codes = [code_of(limited.compute(place(worker))) for _ in range(3)]
-
-    assert codes == ["expired", "expired", "busy"]
-
-
 @pytest.mark.parametrize("reply", [b"", b"\xc1", b"\x90", reply_of(0.0, None, ["x"]), b"\x93\x01\x02\x03"])
 def test_a_reply_of_no_known_form_is_internal(
     worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices, reply: bytes
@@ -132,7 +99,3 @@ def test_a_reply_of_no_known_form_is_internal(
     processes.script = [reply]
 
     assert code_of(limited.compute(place(worker))) == "internal"
-
-
-def test_a_payload_that_cannot_be_passed_on_is_a_bad_request(worker: WorkerParts, limited: LimitedServices):
-    assert code_of(limited.compute(place(worker, payload={"map": 1 << 70}))) == "bad-request"

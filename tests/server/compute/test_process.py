@@ -89,27 +89,6 @@ def test_it_reads_the_objects_of_its_robot_and_of_no_other(ask: Ask):
     assert of_another.code == "not-found"
 
 
-def test_an_extra_that_is_missing_does_not_keep_the_process_from_starting(ask: Ask):
-    assert warmed == ["work"]
-    assert isinstance(ask({"map": b"abc"})[0], Result)
-
-
-@pytest.mark.parametrize(
-    ("payload", "code"),
-    [
-        ({"what": "refuse"}, "too-large"),
-        ({"what": "long"}, "too-large"),
-        ({"what": 7}, "bad-request"),
-        ({"map": {"object": "x"}}, "bad-request"),
-    ],
-)
-def test_what_a_service_refuses_is_a_failure_without_a_defect(ask: Ask, payload: dict[str, Any], code: str):
-    answer, defect = ask(payload)
-
-    assert isinstance(answer, Failure)
-    assert (answer.id, answer.code, answer.trace, defect) == (5, code, "t", "")
-
-
 @pytest.mark.parametrize("what", ["defect", "odd"])
 def test_a_defect_goes_to_the_log_and_not_to_the_robot(ask: Ask, what: str):
     answer, defect = ask({"what": what})
@@ -118,8 +97,3 @@ def test_a_defect_goes_to_the_log_and_not_to_the_robot(ask: Ask, what: str):
     assert answer.code == "internal"
     assert "secret" not in answer.message
     assert defect
-
-
-def test_a_service_without_memory_ends_the_process(ask: Ask):
-    with pytest.raises(MemoryError):
-        ask({"what": "memory"})

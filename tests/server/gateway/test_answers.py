@@ -24,17 +24,6 @@ def test_the_time_that_a_job_waited_is_not_the_servers_clock() -> None:
         assert result.queue_ms == pytest.approx(2000.0)
 
 
-def test_an_unknown_service_is_answered_with_all_that_the_server_offers() -> None:
-    with worker_parts() as worker:
-        worker.registry.others = ("centroid",)
-        connection, wire = worker.join()
-
-        worker.say(connection, Command(id=3, service="centriod", payload={}))
-
-        assert wire.sent[-1].code == "unknown-service"
-        assert wire.sent[-1].message == "no service named 'centriod'; this server offers echo, centroid"
-
-
 @pytest.mark.parametrize(
     ("scopes", "offered"),
     [

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.audit.entry import RefusalLimiter
 from rse_pf.auth.tokens import Claims
 from rse_pf.identity import RobotId
-from rse_pf.server.gateway.audit_recorder import AuditRecorder, ServerAudit
+from rse_pf.server.gateway.audit_recorder import AuditRecorder
 from rse_pf.server.gateway.handshake import Accepted, Rejected
 from rse_pf.server.worker_context import Clocks
 from tests.kit.fakes import FakeLoop
 
 ROBOT = RobotId("default", "robot-1")
 CLAIMS = Claims(robot=ROBOT, token_id="t-1", issued_s=1.0, expires_s=900.0, key_id="k-1")
-ACCEPTED = Accepted(robot=ROBOT, codec="bin", subprotocol="x", claims=CLAIMS)
 REJECTED = Rejected(status=401, body=b"", result="unauthorized", reason="bad-signature-or-claims")
 CLAIMED = "Bearer eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC05IiwianRpIjoidC05In0.c2ln"
 """A token that says it is t-9 of robot-9."""
@@ -69,15 +66,6 @@ def test_a_refused_token_is_recorded_with_its_reason_and_its_claims():
     }  # fmt: skip
 
 
-def test_a_handshake_with_a_wrong_path_is_not_recorded():
-    recording = Recording()
-
-    recording.recorder.record_verdict(Rejected(status=404, body=b"", result="not-found"), "10.0.0.7", CLAIMED)
-    recording.loop.advance(60.0)
-
-    assert recording.notes == []
-
-
 @given(header=st.text(max_size=300) | st.binary(max_size=90).map(lambda b: f"Bearer a.{b.hex()}.c"))
 def test_a_refusal_is_recorded_whatever_the_header_holds(header: str):
     recording = Recording()
@@ -86,29 +74,6 @@ def test_a_refusal_is_recorded_whatever_the_header_holds(header: str):
     recording.loop.advance(0.1)
 
     assert len(recording.notes) == 1
-
-
-def test_a_flood_of_refusals_is_counted():
-    recording = Recording(refusals=RefusalLimiter(per_s=0.01, burst=10.0))
-
-    for _ in range(3000):
-        recording.recorder.record_verdict(REJECTED, "10.0.0.7", CLAIMED)
-    recording.loop.advance(11.0)
-
-    assert [note["action"] for note in recording.notes] == ["auth.refused"] * 10 + ["auth.refused-many"]
-    assert recording.notes[-1]["detail"] == {"bad-signature-or-claims": 2990}
-    recording.loop.advance(60.0)
-    assert len(recording.notes) == 11, "nothing is counted twice"
-
-
-def test_many_notes_travel_in_several_messages():
-    recording = Recording()
-
-    for _ in range(1200):
-        recording.recorder.record_verdict(ACCEPTED, "", "")
-    recording.loop.advance(0.1)
-
-    assert [len(message["notes"]) for message in recording.told] == [500, 500, 200]
 
 
 def test_a_renewal_with_the_same_token_is_not_recorded():
@@ -124,25 +89,3 @@ def test_a_renewal_with_the_same_token_is_not_recorded():
     assert [(note["action"], note["detail"].get("token")) for note in recording.notes] == [
         ("auth.renewed", "t-2"), ("auth.renewal-refused", None), ("auth.cut-off", "t-2"),
     ]  # fmt: skip
-
-
-def test_a_server_without_an_audit_log_records_nothing():
-    recording = Recording(is_on=False)
-
-    recording.recorder.record_verdict(ACCEPTED, "", "")
-    recording.recorder.record_verdict(REJECTED, "", "")
-    recording.loop.advance(60.0)
-    recording.recorder.flush()
-
-    assert recording.told == []
-
-
-@pytest.mark.parametrize("message", [{"event": "audit", "notes": []}])
-def test_without_a_folder_notes_are_dropped(
-    message: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.chdir(tmp_path)
-    with ServerAudit(None, "server-1", on_problem=pytest.fail) as records:
-        records.message_handler(lambda worker, other: None)("worker", message)
-        records.note("server.over")
-    assert list(tmp_path.iterdir()) == []

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 from msgspec import Raw
 
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
-from rse_pf.server.log import JsonLog
 from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
-from rse_pf.wire.server_session import MAX_BAD_MESSAGES
 from tests.kit.fakes import FakeWire
 from tests.kit.worker_parts import WorkerParts, worker_parts
 
@@ -53,15 +48,6 @@ def test_messages_behind_a_long_one_wait_for_it_and_the_socket_is_not_read_meanw
     assert wire.holds == 0
 
 
-def test_a_short_command_is_decoded_at_once(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    worker.say(connection, Command(id=1, service="echo", payload={"value": [1.5] * 1000}))
-
-    assert answered(wire) == [1]
-    assert wire.holds == 0
-
-
 def test_a_small_bomb_is_inflated_by_the_thread_and_its_robot_is_read_more_rarely(worker: WorkerParts):
     connection, wire = worker.join()
     assert len(BOMB) < worker.decoder.short_bytes
@@ -92,17 +78,6 @@ def test_three_long_bombs_close_the_connection_and_ban_the_robot(worker: WorkerP
     assert rates.banned_s(RobotId("default", "r2"), worker.loop.now) == 0
 
 
-def test_a_long_command_of_a_robot_that_left_meanwhile_is_dropped(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    worker.say(connection, LONG)
-    worker.dispatcher.disconnect(connection)
-    worker.loop.run_until(lambda: wire.holds == 0)
-
-    assert answered(wire) == []
-    assert worker.metrics.requests == {}
-
-
 def test_a_long_message_that_finds_the_decoder_full_is_refused_with_its_id():
     with worker_parts(codec="zlib", settings=SETTINGS) as worker:
         connection, wire = worker.join()
@@ -114,20 +89,6 @@ def test_a_long_message_that_finds_the_decoder_full_is_refused_with_its_id():
     assert (refusal.id, refusal.code) == (7, "busy")
     assert refusal.retry_after_ms > 0
     assert worker.metrics.shed["unread"] == 1
-
-
-def test_an_answer_is_written_once_and_only_while_the_socket_exists(worker: WorkerParts):
-    connection, wire = worker.join()
-    answer: Any = worker.codec.encode(Result(id=1, reply=None))
-    assert connection.session is not None
-    connection.session.in_flight = 2
-
-    connection.answer(answer, 1)
-    worker.dispatcher.disconnect(connection)
-    connection.answer(answer, 1)
-
-    assert answered(wire) == [1]
-    assert connection.session.in_flight == 1
 
 
 UNDECODABLE = CODEC.encode(Command(id=7, service="echo", payload=Raw(b"[1,NaN]")))
@@ -149,31 +110,3 @@ def test_commands_that_cannot_be_decoded_are_answered_and_the_next_valid_one_wor
     assert wire.pauses == pytest.approx([0.1, 0.2, 0.3, 0.4] + [0.5] * 10)
     assert worker.admission.rates.banned_s(connection.robot, worker.loop.now) == 0
     assert worker.metrics.requests["unknown", "bad-message"] == 14
-
-
-def test_a_long_command_that_cannot_be_decoded_is_answered_with_its_id(worker: WorkerParts):
-    connection, wire = worker.join()
-    long = CODEC.encode(Command(id=9, service="echo", payload=Raw(b"[" + b"1," * 60_000 + b"1]")))
-
-    worker.say(connection, long)
-    worker.loop.run_until(lambda: answered(wire))
-
-    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [(9, "too-large")]
-
-
-def test_the_log_names_why_a_message_was_refused_and_a_robot_cut_off(tmp_path: Path):
-    with (tmp_path / "log").open("wb") as file:
-        log = JsonLog(level="info", server="s-1", wall_clock=lambda: 0.0, fd=file.fileno()).start()
-        worker = WorkerParts(log, codec="zlib")
-        connection, _ = worker.join()
-        worker.say(connection, UNDECODABLE)
-        for _ in range(MAX_BAD_MESSAGES + 1):
-            worker.say(connection, b"no zlib stream")
-        worker.dispatcher.close_all()
-        log.close()
-    lines = [json.loads(line) for line in (tmp_path / "log").read_text(encoding="utf-8").splitlines()]
-
-    refused = [line for line in lines if line["event"] == "undecodable"]
-    assert [(each["id"], each["code"]) for each in refused[:2]] == [(7, "bad-message"), (None, "bad-message")]
-    assert refused[1]["reason"] == "not a zlib stream"
-    assert [line["reason"] for line in lines if line["event"] == "cut-off"] == ["bad-messages"]

@@ -16,10 +16,10 @@ from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
 from rse_pf.service import Registry
 from rse_pf.storage.object_store import MemoryStore, digest_of
-from rse_pf.wire import Cancel, Command, Failure, Move, Ping, Pong, Result, Welcome
+from rse_pf.wire import Command, Failure, Ping, Pong, Result, Welcome
 from tests.kit.admitted_commands import measure_turns, queued
 from tests.kit.fakes import FakeLoop, FakeWire
-from tests.kit.worker_parts import BINARY, UNIX_S, WorkerParts, worker_parts
+from tests.kit.worker_parts import BINARY, WorkerParts, worker_parts
 
 SETTINGS = PlatformSettings()
 
@@ -84,26 +84,6 @@ def refused(wire: FakeWire) -> list[int | None]:
     return [message.id for message in wire.sent if isinstance(message, Failure)]
 
 
-def test_hello_ping_and_a_cheap_command_are_answered_inline(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    worker.say(connection, Ping(sent_s=1.0))
-    worker.say(connection, echo(3))
-
-    assert [type(m) for m in wire.sent] == [Welcome, Pong, Result]
-    assert connection.session is not None
-    assert connection.session.in_flight == 0
-
-
-def test_a_reply_that_cannot_be_encoded_is_an_internal_failure(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    worker.say(connection, Command(id=3, service="odd", payload={}))
-
-    assert isinstance(wire.sent[-1], Failure)
-    assert (wire.sent[-1].id, wire.sent[-1].code) == (3, "internal")
-
-
 def test_a_named_object_is_read_by_a_thread_and_a_large_reply_is_stored_in_turn():
     store, data, threads = MemoryStore(), bytes(2 * SETTINGS.session.max_message_bytes), set()
     store.put(object_name(RobotId("default", "r"), digest_of(data)), data)
@@ -124,52 +104,6 @@ def test_a_named_object_is_read_by_a_thread_and_a_large_reply_is_stored_in_turn(
     reply = msgspec.msgpack.decode(get(object_name(RobotId("default", "r"), result.object)), type=Large)
     assert reply.data == data
     assert threads == {"solver-0"}, "the event loop never waits for the store"
-
-
-def test_a_kind_of_service_that_this_server_does_not_run_is_refused(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    worker.say(connection, Command(id=3, service="kept", payload={}))
-
-    assert wire.sent[-1].code == "unknown-service"
-    assert worker.dispatcher.held == 0
-
-
-@pytest.mark.parametrize(
-    ("hello", "expires_s", "seconds", "code"),
-    [(False, None, 5.0, 4400), (True, None, 5.0, 1001), (True, UNIX_S + 2.0, 2.0, 4401)],
-)
-def test_connections_without_hello_ping_or_token_are_closed_in_time(
-    worker: WorkerParts, hello: bool, expires_s: float | None, seconds: float, code: int
-):
-    _, wire = worker.join(hello=hello, expires_s=expires_s)
-
-    worker.loop.advance(seconds - 0.1)
-    assert wire.closed is None
-    worker.loop.advance(1.1)
-
-    assert wire.closed is not None
-    assert wire.closed[0] == code
-
-
-def test_a_robot_that_pings_stays(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    for _ in range(20):
-        worker.loop.advance(2.0)
-        worker.say(connection, Ping(sent_s=worker.loop.now))
-
-    assert wire.closed is None
-
-
-def test_nothing_is_written_behind_a_close(worker: WorkerParts):
-    connection, wire = worker.join()
-    connection.close(1001, "leaving")
-
-    connection.write(worker.codec.encode(Move(reason="drain", within_ms=1.0)))
-    worker.say(connection, Ping(sent_s=1.0))
-
-    assert [type(m) for m in wire.sent] == [Welcome]
 
 
 def overload(worker: WorkerParts) -> QueuedCommand:
@@ -195,21 +129,6 @@ def end_overload(worker: WorkerParts, running: QueuedCommand) -> None:
     """End the command that runs, and those that wait for it."""
     worker.scheduler.leave("waits")
     worker.scheduler.done(running, worker.loop.now)
-
-
-def test_a_server_that_is_behind_refuses_without_decoding(worker: WorkerParts):
-    connection, wire = worker.join()
-    worker.say(connection, echo(7, deadline_ms=250.0))
-    overload(worker)
-    assert connection.session is not None
-
-    number = send_until_refused(worker, connection, wire)
-
-    assert (wire.sent[-1].id, wire.sent[-1].code) == (number, "busy")
-    assert 500.0 <= wire.sent[-1].retry_after_ms <= 1500.0
-    assert connection.session.in_flight == number - 10, "those that were accepted before"
-    assert worker.metrics.shed["unread"] == 1
-    assert worker.metrics.requests["echo", "busy"] == 1
 
 
 def test_a_robot_that_has_to_pause_is_refused_until_then_while_others_wait(worker: WorkerParts):
@@ -306,31 +225,6 @@ def test_a_round_of_the_loop_computes_for_a_millisecond_so_that_the_queue_is_see
     assert [len(results(wire)) for _, wire in robots] == [1] * 6
 
 
-def test_the_longest_recent_wait_is_reported(worker: WorkerParts):
-    for name in "abc":
-        worker.say(worker.join(name)[0], half(1))
-    worker.loop.now += 0.3
-    worker.loop.turn()
-
-    assert worker.dispatcher.snapshot()["gauges"]["queue_ms"] == pytest.approx(300.0)
-    worker.loop.now += 3.0
-    assert worker.dispatcher.snapshot()["gauges"]["queue_ms"] == 0.0
-
-
-def test_an_emulated_server_without_budget_starts_nothing_until_its_timer():
-    with worker_parts(emulated_cores=0.25) as worker:
-        connection, wire = worker.join()
-        worker.cpu_s = 0.02 + 0.01
-
-        worker.say(connection, echo(1))
-        assert results(wire) == []
-        worker.loop.advance(0.039)
-        assert results(wire) == []
-        worker.loop.advance(0.002)
-
-        assert len(results(wire)) == 1
-
-
 def test_a_robot_that_sends_undecodable_messages_is_read_more_and_more_rarely(worker: WorkerParts):
     connection, wire = worker.join()
 
@@ -357,16 +251,6 @@ def test_a_flood_is_refused_by_id_and_then_cut_off(worker: WorkerParts):
     assert wire.closed == (4429, "rate")
     assert worker.admission.rates.banned_s(connection.robot, worker.loop.now) > 0
     assert worker.metrics.shed["rate"] == 120
-
-
-def test_a_message_without_a_recognisable_id_is_refused_without_one(worker: WorkerParts):
-    connection, wire = worker.join()
-
-    for _ in range(41):
-        worker.say(connection, Ping(sent_s=1.0))
-
-    assert isinstance(wire.sent[-1], Failure)
-    assert (wire.sent[-1].code, wire.sent[-1].id) == ("busy", None)
 
 
 class Queue(CommandQueue):
@@ -407,26 +291,6 @@ class Queue(CommandQueue):
 
     def close(self) -> None:
         self.told.append("close")
-
-
-def test_each_queue_learns_of_connections_withdrawals_and_the_end_of_the_server():
-    queues = [Queue("one"), Queue("two")]
-    with worker_parts(queues=queues) as worker:
-        connection, _ = worker.join()
-        worker.say(connection, Command(id=7, service="two", payload={}))
-        worker.say(connection, Cancel(id=7))
-        report = worker.dispatcher.snapshot()
-        worker.dispatcher.move_all("drain", 500.0)
-        worker.dispatcher.disconnect(connection)
-        worker.dispatcher.disconnect(connection)
-
-    for queue in queues:
-        assert queue.told == [
-            ("enter", connection), ("withdraw", connection, 7), "give-up", ("leave", connection), "close",
-        ]  # fmt: skip
-    assert [len(queue.submitted) for queue in queues] == [0, 1]
-    assert worker.metrics.requests["unknown", "disconnected"] == 1
-    assert (report["gauges"]["one"], report["gauges"]["two"]) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("service", ["installed", "long", "echo"])
@@ -478,18 +342,3 @@ def test_a_round_computes_for_as_long_as_it_may(since_s: float, leaves_unread: b
         worker.loop.turn()
 
         assert sum(len(results(wire)) for _, wire in asked) - before == computed
-
-
-def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
-    connection, wire = worker.join()
-    other, _ = worker.join("other")
-    worker.say(other, half(1))
-    worker.say(other, half(2))
-    worker.say(connection, echo(2))
-
-    worker.dispatcher.disconnect(connection)
-    worker.loop.advance()
-
-    assert worker.metrics.requests["echo", "disconnected"] == 1
-    assert results(wire) == []
-    assert worker.dispatcher.connections == {other}

@@ -31,28 +31,6 @@ def frame_bytes(opcode: int, fin: bool, payload: bytes, mask: bytes = b"\0\0\0\0
     return bytes([(128 if fin else 0) | opcode]) + length + mask + masked
 
 
-def test_one_frame_is_a_message():
-    assert assembler().receive(BINARY, True, False, b"\xff", 0.0) == Received(b"\xff", False)
-
-
-def test_fragments_are_joined_and_control_frames_may_stand_between_them():
-    frames = assembler()
-
-    assert frames.receive(TEXT, False, False, b"a", 0.0) is None
-    assert frames.receive(PING, True, False, b"?", 0.0) == SendPong(b"?")
-    assert frames.receive(CONTINUATION, False, False, b"", 0.0) is None
-    assert frames.receive(CONTINUATION, True, False, b"b", 0.0) == Received(b"ab", True)
-
-
-def test_a_character_may_be_split_between_fragments():
-    frames = assembler()
-    first, second = "é".encode()[:1], "é".encode()[1:]
-
-    frames.receive(TEXT, False, False, first, 0.0)
-
-    assert frames.receive(CONTINUATION, True, False, second, 0.0) == Received("é".encode(), True)
-
-
 @pytest.mark.parametrize(
     ("opcode", "fin", "rsv", "payload", "code"),
     [
@@ -79,41 +57,12 @@ def test_a_broken_rule_closes_with_its_code(opcode, fin, rsv, payload, code):
     assert decision.code == code
 
 
-def test_a_new_message_inside_of_a_message_is_refused():
-    frames = assembler()
-    frames.receive(TEXT, False, False, b"a", 0.0)
-
-    assert frames.receive(TEXT, True, False, b"b", 0.0) == CloseSocket(1002, "a message inside of a message")
-
-
-def test_empty_fragments_count():
-    frames = assembler()
-    frames.receive(BINARY, False, False, b"", 0.0)
-    decisions = [frames.receive(CONTINUATION, False, False, b"", 0.0) for _ in range(4)]
-
-    assert decisions == [None, None, None, CloseSocket(1009, "too many fragments")]
-
-
-def test_the_size_limit_holds_for_all_fragments_together():
-    frames = assembler()
-    frames.receive(BINARY, False, False, b"x" * 1500, 0.0)
-
-    assert frames.receive(CONTINUATION, True, False, b"x" * 501, 0.0) == CloseSocket(1009, "message too big")
-
-
 def test_control_frames_have_a_rate_that_recovers():
     frames = assembler()
 
     assert all(frames.receive(PONG, True, False, b"", 5.0) is None for _ in range(3))
     assert isinstance(frames.receive(PING, True, False, b"", 5.4), SendPong)
     assert frames.receive(PING, True, False, b"", 5.5) == CloseSocket(1008, "too many control frames")
-
-
-def test_frames_behind_a_close_are_ignored():
-    frames = assembler()
-    frames.receive(CLOSE, True, False, b"", 0.0)
-
-    assert frames.receive(BINARY, True, False, b"x", 0.0) is None
 
 
 messages = st.lists(

@@ -78,22 +78,6 @@ def test_robots_take_turns(worker: WorkerParts, processes: HeldProcesses):
     assert processes.robots == ["one", "other", "one", "one"]
 
 
-def test_a_command_whose_deadline_passes_in_the_queue_never_runs(
-    worker: WorkerParts, processes: HeldProcesses
-):
-    processes.script = [reply_of(1.0, None)]
-    (one, _), (other, wire) = worker.join("one"), worker.join("other")
-    worker.say(one, asked(1))
-    worker.say(other, asked(2, deadline_ms=100.0))
-
-    worker.loop.advance(0.2)
-    processes.go.release()
-    worker.loop.run_until(lambda: not worker.dispatcher.held)
-
-    assert answers(wire) == [(2, "expired")]
-    assert processes.robots == ["one"]
-
-
 def test_a_robot_that_is_kept_out_is_answered_at_once_and_solves_on(
     worker: WorkerParts, processes: HeldProcesses
 ):
@@ -110,25 +94,3 @@ def test_a_robot_that_is_kept_out_is_answered_at_once_and_solves_on(
     assert answers(wire) == [(1, "crashed"), (2, "crashed"), (3, "busy"), (4, "ok")]
     assert worker.metrics.shed["blocked"] == 1
     assert worker.dispatcher.snapshot()["gauges"]["compute_blocked_robots"] == 1.0
-
-
-def test_commands_of_a_robot_that_left_are_dropped(worker: WorkerParts, processes: HeldProcesses):
-    processes.script = [reply_of(1.0, None)]
-    one, _ = worker.join("one")
-    for number in (1, 2, 3):
-        worker.say(one, asked(number))
-    worker.loop.run_until(lambda: processes.robots)
-
-    worker.dispatcher.disconnect(one)
-    held = worker.dispatcher.held
-    processes.go.release()
-    worker.loop.run_until(lambda: not worker.dispatcher.held)
-
-    assert held == 1
-    assert processes.robots == ["one"]
-
-
-def test_closing_ends_the_processes(worker: WorkerParts, processes: HeldProcesses):
-    worker.dispatcher.close_all()
-
-    assert processes.is_closed

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -42,49 +41,7 @@ def test_no_more_are_asked_in_any_second_than_allowed(robots_of, robots, spread_
     assert all(t <= max(spread_s, len(times) / rate) * (1 + 1e-12) for t in times)
 
 
-def test_the_requests_to_move_fill_the_given_time() -> None:
-    (delays,) = plan([100], 10, spread_s=5.0, moves_per_s=1000.0, random=lambda: 0.5)
-
-    assert delays == pytest.approx([0.25 + 0.5 * i for i in range(10)])
-
-
 def test_the_most_loaded_worker_asks_its_robots_first() -> None:
     delays = plan([10, 30], 20, spread_s=1.0, moves_per_s=1000.0, random=lambda: 0.0)
 
     assert [len(each) for each in delays] == [0, 20]
-
-
-def test_each_robot_is_asked_once() -> None:
-    loop, connections = FakeLoop(50.0), [Connection() for _ in range(5)]
-    moves = migration(connections, loop)
-
-    moves.begin([0.1, 0.2, 0.3, 0.4], within_ms=5000.0)
-    loop.advance(10.0)
-
-    assert [len(connection.asks) for connection in connections] == [1, 1, 1, 1, 0]
-    assert connections[0].asks[0] == ("rebalance", 5000.0, pytest.approx(50.1))
-    assert moves.asked == 4
-
-
-def test_a_robot_that_came_back_may_be_asked_again_once_its_time_is_over() -> None:
-    loop, connections = FakeLoop(50.0), [Connection()]
-    moves = migration(connections, loop)
-
-    moves.begin([0.0, 0.9, 1.1], within_ms=1000.0)
-    loop.advance(10.0)
-
-    assert [now for _, _, now in connections[0].asks] == pytest.approx([50.0, 51.1])
-
-
-def test_a_robot_without_hello_is_not_asked_and_a_robot_that_left_is_forgotten() -> None:
-    loop, connections = FakeLoop(50.0), [Connection(may_move=False), Connection()]
-    moves = migration(connections, loop)
-
-    moves.begin([0.0], within_ms=1000.0)
-    loop.advance(10.0)
-    assert [len(connection.asks) for connection in connections] == [0, 1]
-
-    connections.pop()
-    moves.begin([0.0], within_ms=1000.0)
-    loop.advance(10.0)
-    assert moves.asked == 1

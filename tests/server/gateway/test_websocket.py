@@ -5,28 +5,8 @@ from __future__ import annotations
 import errno
 from types import SimpleNamespace
 
-from picows import picows
-
-from rse_pf.server.gateway.websocket import Listener, RobotProtocol
-from rse_pf.server.scheduling.socket_poller import SocketPoller
+from rse_pf.server.gateway.websocket import Listener
 from tests.kit.fakes import FakeLoop
-
-
-async def test_the_protocol_takes_the_options_that_we_give_it():
-    poller = SocketPoller(FakeLoop(), clock=lambda: 0.0)
-    protocol = RobotProtocol(
-        picows.WSListener(), "", b"", b"", max_frame_bytes=1000, poller=poller, on_end=lambda: None
-    )
-
-    assert isinstance(protocol, picows.WSProtocol)
-    assert protocol.transport is None
-    assert len(protocol.get_buffer(-1)) >= 1024
-
-
-def test_opcodes_are_the_numbers_of_the_rfc():
-    names = ("CONTINUATION", "TEXT", "BINARY", "CLOSE", "PING", "PONG")
-
-    assert [int(getattr(picows.WSMsgType, name)) for name in names] == [0, 1, 2, 8, 9, 10]
 
 
 def test_a_socket_that_the_robot_has_reset_can_be_closed():

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from rse_pf.errors import BadRequest, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, job_key, record_name, verdict_on
+from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
 from rse_pf.storage.object_store import MemoryStore
 
 NAME = record_name(RobotId("default", "robot-1"), "ab" * 32)
@@ -64,34 +62,6 @@ def test_the_verdict_follows_from_the_record(record, unchanged_s, is_watched, ex
     assert found == expected
 
 
-def test_of_two_processes_that_take_a_job_one_succeeds(store, clock):
-    one, other = looked(store, "one", clock), looked(store, "other", clock)
-
-    assert [one.take(), other.take()] == [True, False]
-    assert (one.is_ours, other.is_ours) == (True, False)
-    assert verdict(other) == "follow"
-
-
-def test_an_owner_that_renews_keeps_the_job_and_one_that_does_not_loses_it(store, clock):
-    one, other = looked(store, "one", clock), looked(store, "other", clock)
-    one.take()
-    for _ in range(20):
-        clock.now += LEASE_S - 0.1
-        assert one.renew(0.5, "half")
-        assert verdict(other) == "follow"
-    assert other.record is not None
-    assert (other.record.share, other.record.what) == (0.5, "half")
-
-    clock.now += LEASE_S
-    assert verdict(other) == "take"
-    assert other.take()
-
-    assert not one.renew(0.6, "late")
-    assert not one.is_ours
-    assert not one.end(JobRecord(state="done", owner="", reply="cd"))
-    assert verdict(one) == "follow"
-
-
 def test_a_process_that_reads_a_record_for_the_first_time_waits_a_whole_lease(store, clock):
     looked(store, "one", clock).take()
     clock.now += 1000.0
@@ -119,36 +89,3 @@ def test_crashes_of_owners_are_counted_but_not_orderly_ends(store, clock):
     last.take()
     assert last.record is not None
     assert last.record.tries == 1
-
-
-def test_the_owner_learns_that_a_follower_cancels_the_job(store, clock):
-    owner, follower = looked(store, "owner", clock), looked(store, "follower", clock)
-    owner.take()
-    follower.read()
-
-    follower.ask_to_cancel()
-
-    assert not owner.renew(0.5, "half")
-    assert owner.is_ours
-    assert owner.record is not None
-    assert owner.record.cancel
-
-
-def test_the_key_of_a_job_is_the_digest_of_its_request(store):
-    asked = {"a": 1, "b": [1.5]}
-    key = job_key("merge", asked, "s")
-
-    assert key == job_key("merge", {"b": [1.5], "a": 1}, "s")
-    others = [("optimise", asked, "s"), ("merge", {"a": 2, "b": [1.5]}, "s"), ("merge", asked, "t")]
-    assert len({key, *(job_key(*other) for other in others)}) == 4
-    arrays = [job_key("merge", {"a": np.array([value])}, "s") for value in (0.5, 0.5, 0.25)]
-    assert arrays[0] == arrays[1] != arrays[2]
-    with pytest.raises(BadRequest):
-        job_key("merge", {"a": object()}, "s")
-
-
-def test_an_invalid_record_is_a_failure_of_the_store(store, clock):
-    store.put(NAME, b"not a record")
-
-    with pytest.raises(StoreError, match="no record"):
-        looked(store, "one", clock)

@@ -7,7 +7,6 @@ import itertools
 import os
 import queue
 import socket
-import threading
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +17,6 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.processes.ipc import encode_message
-from rse_pf.server.jobs.lease import JobRecord
 from rse_pf.server.jobs.manager import JobManager
 from rse_pf.server.jobs.process import JobRequest
 from rse_pf.server.jobs.runner import JobContext
@@ -55,7 +53,7 @@ class FakeProcess:
         return 0
 
 
-class Bench:
+class ManagedJobs:
     """A job manager with processes that do what the test says."""
 
     def __init__(self, **serving: Any) -> None:
@@ -100,10 +98,10 @@ class Bench:
 
 @pytest.fixture
 def make():
-    benches: list[Bench] = []
+    benches: list[ManagedJobs] = []
 
-    def make(**serving: Any) -> Bench:
-        benches.append(Bench(**serving))
+    def make(**serving: Any) -> ManagedJobs:
+        benches.append(ManagedJobs(**serving))
         return benches[-1]
 
     yield make
@@ -115,12 +113,12 @@ def robot(name: str = "robot-1", tenant: str = "default") -> Any:
     return SimpleNamespace(robot=RobotId(tenant, name), claims=None)
 
 
-def ask(bench: Bench, owner: Any, identity: int, value: int = 1) -> None:
+def ask(bench: ManagedJobs, owner: Any, identity: int, value: int = 1) -> None:
     command = Command(id=identity, service="long", payload={"value": value})
     bench.jobs.submit(QueuedCommand(owner, owner.robot, command, 10, 100.0, 105.0), 100.0)
 
 
-def known(bench: Bench) -> float:
+def known(bench: ManagedJobs) -> float:
     return bench.jobs.report().gauges["jobs"]
 
 
@@ -143,16 +141,6 @@ def test_two_commands_with_the_same_request_wait_for_the_same_run(make, monkeypa
     assert bench.started.empty()
     assert known(bench) == 0
     assert bench.jobs.report().cpu_s == {"jobs": {"acme": 3.25}}, "it was computed once"
-
-
-def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
-    bench = make(max_running_jobs=3)
-    for identity, owner in enumerate((robot(), robot("robot-2"), robot(tenant="another"))):
-        ask(bench, owner, identity)
-
-    asked = [bench.process() for _ in range(3)]
-
-    assert len({each.request.robot for each in asked}) == 3
 
 
 def test_a_process_that_cannot_be_started_does_not_count_as_a_crash_of_the_server(make):
@@ -220,20 +208,6 @@ def test_progress_is_sent_at_once_then_at_most_twice_a_second_and_never_repeated
     assert len(progress_of_1()) == 2
 
 
-def test_a_cancelled_command_leaves_the_job_to_the_others_that_wait(make):
-    bench, owner = make(), robot()
-    ask(bench, owner, 1)
-    ask(bench, owner, 2)
-    process = bench.process()
-
-    bench.jobs.withdraw(owner, 1)
-    assert code(bench.answers[1]) == "cancelled"
-    process.done()
-    bench.run_until(lambda: 2 in bench.answers)
-
-    assert code(bench.answers[2]) == "ok"
-
-
 def test_cancelling_the_last_command_ends_the_job_and_a_request_meanwhile_gets_a_new_run(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
@@ -261,20 +235,3 @@ def test_a_robot_cannot_cancel_the_commands_of_another(make):
     bench.run_until(lambda: len(bench.answers) == 2)
 
     assert {code(answer) for answer in bench.answers.values()} == {"ok"}
-
-
-def test_old_records_are_deleted_when_a_job_ends(make):
-    bench, owner = make(), robot()
-    old = "jobs/default/robot-9/" + "0" * 64
-    bench.store.put(old, msgspec.json.encode(JobRecord(state="done", owner="", marked_s=1.0)))
-    ask(bench, owner, 1)
-
-    bench.process().done()
-    bench.run_until(lambda: 1 in bench.answers)
-    for thread in threading.enumerate():
-        if thread.name.startswith("job-"):
-            thread.join(WAIT_S)
-
-    names = [info.name for info in bench.store.list("jobs/")]
-    assert len(names) == 1
-    assert old not in names

@@ -55,21 +55,6 @@ def test_a_worker_that_is_killed_gives_its_slot_back(file: int) -> None:
     assert JobSlots(file, 1).acquire(ONE, stop)
 
 
-def test_a_server_has_as_many_slots_as_its_settings_say(file: int) -> None:
-    slots = JobSlots(file, 2)
-
-    assert [slots.acquire(robot, stop) for robot in (ONE, TWO, ONE)] == [True, True, False]
-
-
-def test_a_robot_that_gave_up_waiting_leaves_its_turn_to_the_next(file: int) -> None:
-    slots = JobSlots(file, 1)
-    slots.acquire(ONE, stop)
-    assert not slots.acquire(ONE, stop)
-    slots.release()
-
-    assert slots.acquire(TWO, stop)
-
-
 def test_the_slot_goes_to_the_robot_whose_turn_it_is_although_another_one_asks(
     file: int,
 ) -> None:

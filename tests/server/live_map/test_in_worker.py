@@ -57,18 +57,6 @@ def keyframes(wire: Any) -> list[int]:
     return [message.payload["keyframes"] for message in wire.sent if isinstance(message, Update)]
 
 
-def test_a_subscriber_gets_the_present_state_and_then_each_newer_one(worker: Worker) -> None:
-    connection, wire = worker.subscriber()
-
-    worker.say(connection, Subscribe(id=4, topic="live/m"))
-    worker.tell(1)
-    worker.tell(2)
-
-    assert keyframes(wire) == [1, 2]
-    assert [message.seq for message in wire.sent] == [2, 3]
-    assert worker.dispatcher.snapshot()["gauges"]["subscriptions"] == 1.0
-
-
 def test_a_robot_without_the_capability_is_refused_and_sees_nothing_new(worker: Worker) -> None:
     connection, wire = worker.join()
     wire.sent.clear()
@@ -94,67 +82,6 @@ def test_a_ninth_subscription_is_above_the_quota_until_one_ends(worker: Worker) 
 
     assert [name for _, name in worker.client.watched] == [f"m{number}" for number in range(9)]
     assert worker.client.unwatched == [("default", "m0")]
-
-
-def test_a_subscription_of_a_live_id_begins_again(worker: Worker) -> None:
-    connection, wire = worker.subscriber()
-    worker.say(connection, Subscribe(id=4, topic="live/m"))
-    worker.tell(1)
-    wire.sent.clear()
-
-    worker.say(connection, Subscribe(id=4, topic="live/m"))
-    worker.loop.advance(0.1)
-
-    assert [(message.id, message.seq) for message in wire.sent] == [(4, 1)]
-    assert worker.dispatcher.snapshot()["gauges"]["subscriptions"] == 1.0
-
-
-def test_a_refused_subscription_leaves_its_place_to_another(worker: Worker) -> None:
-    connection, wire = worker.subscriber()
-    for _ in range(2 * MAX_SUBSCRIPTIONS):
-        worker.say(connection, Subscribe(id=4, topic="platform"))
-
-    assert [message.code for message in wire.sent] == ["bad-request"] * 2 * MAX_SUBSCRIPTIONS
-    assert connection.session is not None
-    assert connection.session.topics == {}
-
-
-def test_the_end_of_a_connection_ends_its_subscriptions(worker: Worker) -> None:
-    connection, _ = worker.subscriber()
-    worker.say(connection, Subscribe(id=4, topic="live/m"))
-
-    worker.dispatcher.disconnect(connection)
-
-    assert worker.client.unwatched == [("default", "m")]
-    worker.tell(1)
-
-
-def test_a_closing_connection_is_not_written_to(worker: Worker) -> None:
-    connection, wire = worker.subscriber()
-    worker.say(connection, Subscribe(id=4, topic="live/m"))
-
-    connection.close(1001, "leaving")
-    worker.tell(1)
-
-    assert keyframes(wire) == []
-
-
-def test_a_refused_command_is_answered_and_counted(worker: Worker) -> None:
-    connection, wire = worker.subscriber()
-
-    worker.say(connection, Command(id=9, service="live-keyframe", payload={"map": "m"}))
-
-    [failure] = wire.sent
-    assert (failure.id, failure.code) == (9, "bad-request")
-    assert connection.session is not None
-    assert connection.session.in_flight == 0
-    assert sum(worker.metrics.requests.values()) == 1
-
-
-def test_a_server_that_drains_gives_its_maps_up(worker: Worker) -> None:
-    worker.dispatcher.move_all("drain", 1000.0)
-
-    assert worker.client.gave_up
 
 
 def test_without_live_maps_topics_and_services_are_unknown() -> None:

@@ -10,16 +10,15 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import Busy, NotFound
+from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId
 from rse_pf.processes.ipc import encode_message
 from rse_pf.server.live_map.connection_security import server_context
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, lease_name
-from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection, can_begin_map
+from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection
 from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerPool, MapServerProcess
 from rse_pf.storage.object_store import MemoryStore
-from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
-from tests.kit.fake_map import keyframe_request
+from rse_pf.wire.live_map import KeyframeRequest
 from tests.kit.fakes import FakeLog
 
 LEASE = lease_name("default", "warehouse")
@@ -62,7 +61,7 @@ class FakeProcess:
         return 0
 
 
-class Worker:
+class ConnectedWorker:
     """One worker with its connection to one map."""
 
     def __init__(self) -> None:
@@ -90,7 +89,7 @@ class Worker:
             return decode_lease(LEASE, self.store.get(LEASE))
         return None
 
-    async def __aenter__(self) -> Worker:
+    async def __aenter__(self) -> ConnectedWorker:
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -113,7 +112,7 @@ async def until(is_so: Callable[[], Any]) -> None:
 
 
 async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched() -> None:
-    async with Worker() as worker:
+    async with ConnectedWorker() as worker:
         worker.map.set_watched(True)
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
@@ -128,24 +127,7 @@ async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_wa
         sent.cancel()
 
 
-async def test_a_map_server_of_another_worker_is_used_before_the_own_process_is_ready() -> None:
-    """Otherwise the robots of this server would wait until its own process has started."""
-
-    async with Worker() as worker:
-        sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 5.0))
-        await until(lambda: worker.started)  # it never gets ready
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            listener.setblocking(False)
-            elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
-            assert elsewhere.claim(None)
-            assert elsewhere.serve("127.0.0.1", listener.getsockname()[1], "c")
-            connection, _ = await asyncio.get_running_loop().sock_accept(listener)
-            connection.close()
-        assert worker.started[0].claims == 0
-        sent.cancel()
-
-
-def owner_on_a_closed_port(worker: Worker) -> None:
+def owner_on_a_closed_port(worker: ConnectedWorker) -> None:
     """Write a lease of another server with a port at which nobody listens."""
     elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
     assert elsewhere.claim(None)
@@ -155,7 +137,7 @@ def owner_on_a_closed_port(worker: Worker) -> None:
 
 
 async def test_a_map_server_whose_port_is_closed_is_replaced_at_once_by_workers_that_were_connected() -> None:
-    async with Worker() as worker:
+    async with ConnectedWorker() as worker:
         owner_on_a_closed_port(worker)
         worker.map._reached_owner = "b"
         began_s = time.monotonic()
@@ -168,7 +150,7 @@ async def test_a_map_server_whose_port_is_closed_is_replaced_at_once_by_workers_
 
 
 async def test_a_connection_that_is_closed_before_its_welcome_closes_its_socket() -> None:
-    async with Worker() as worker:
+    async with ConnectedWorker() as worker:
         is_greeted, is_gone = asyncio.Event(), asyncio.Event()
 
         async def owner(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -191,21 +173,8 @@ async def test_a_connection_that_is_closed_before_its_welcome_closes_its_socket(
         server.close()
 
 
-async def test_a_map_server_whose_port_was_never_reached_keeps_its_lease() -> None:
-    """A firewall may refuse what the other servers can reach."""
-
-    async with Worker() as worker:
-        owner_on_a_closed_port(worker)
-        sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 0.3))
-        await until(lambda: worker.started)
-        worker.started[0].tell("ready")
-        await asyncio.wait({sent})
-        assert isinstance(sent.exception(), Busy)
-        assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
-
-
 async def test_who_may_only_watch_starts_no_process_and_gets_the_state_idle() -> None:
-    async with Worker() as worker:
+    async with ConnectedWorker() as worker:
         lease = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert lease.claim(None)
         assert lease.release()
@@ -222,18 +191,10 @@ async def test_who_may_only_watch_starts_no_process_and_gets_the_state_idle() ->
 
 
 async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
-    async with Worker() as worker:
+    async with ConnectedWorker() as worker:
         owner_on_a_closed_port(worker)
         worker.map._reached_owner = "b"
         worker.map.set_watched(True, may_start=False)
         await until(lambda: worker.updates and worker.updates[-1]["state"] == "idle")
         assert worker.started == []
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
-
-
-def test_only_a_first_keyframe_or_an_operator_begins_a_map():
-    assert can_begin_map(keyframe_request(0))
-    assert can_begin_map(LiveStart(map="m"))
-    assert not can_begin_map(keyframe_request(1))
-    assert not can_begin_map(keyframe_request(0, segment=1))
-    assert not can_begin_map(LiveMapRequest(map="m"))

@@ -31,7 +31,7 @@ class FakeProcess:
         return 0
 
 
-class Worker:
+class MapServerProcesses:
     """The processes of one worker, and time that the test sets."""
 
     def __init__(self, max_processes: int) -> None:
@@ -43,7 +43,7 @@ class Worker:
             clock=lambda: self.now_s,
         )
 
-    async def __aenter__(self) -> Worker:
+    async def __aenter__(self) -> MapServerProcesses:
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -65,7 +65,7 @@ class Worker:
 
 
 async def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -> None:
-    async with Worker(3) as worker:
+    async with MapServerProcesses(3) as worker:
         for _ in range(3):
             await worker.gets("acme")
         assert worker.take("acme") is None
@@ -78,25 +78,8 @@ async def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -
         assert worker.held() == ["acme", "acme", "rival"]
 
 
-async def test_the_map_that_was_is_watched_only_for_longest_gives_up_first() -> None:
-    async with Worker(3) as worker:
-        first, second, third = [await worker.gets("acme") for _ in range(3)]
-        second.unused_since_s, third.unused_since_s = 5.0, 4.0
-        await worker.gets("rival")
-        assert third not in worker.pool.in_use
-        assert {first, second} < set(worker.pool.in_use)
-
-
-async def test_a_map_that_is_watched_only_gives_up_for_another_one_of_its_tenant() -> None:
-    async with Worker(1) as worker:
-        watched = await worker.gets("acme")
-        watched.unused_since_s = 1.0
-        driven = await worker.gets("acme")
-        assert worker.pool.in_use == [driven]
-
-
 async def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> None:
-    async with Worker(3) as worker:
+    async with MapServerProcesses(3) as worker:
         for _ in range(2):
             await worker.gets("acme")
         watched = await worker.gets("rival")
@@ -108,7 +91,7 @@ async def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> N
 
 
 async def test_a_map_that_is_watched_only_takes_a_process_only_while_no_other_map_wants_one() -> None:
-    async with Worker(1) as worker:
+    async with MapServerProcesses(1) as worker:
         watched = await worker.gets("acme")
         watched.unused_since_s = 1.0
         assert worker.take("rival", is_watched_only=True) is None
@@ -122,7 +105,7 @@ async def test_a_map_that_is_watched_only_takes_a_process_only_while_no_other_ma
 
 
 async def test_a_process_whose_map_gets_commands_is_not_the_first_to_be_released() -> None:
-    async with Worker(1) as worker:
+    async with MapServerProcesses(1) as worker:
         child = worker.pool.prepare_spare()
         assert child is not None
         process = child._process
@@ -146,7 +129,7 @@ async def test_the_cpu_time_of_map_servers_counts_for_their_tenants_also_after_t
     taken_s = [0.0]
     monkeypatch.setattr("rse_pf.server.live_map.process_pool.cpu_seconds", lambda pid: taken_s[0])
 
-    async with Worker(2) as worker:
+    async with MapServerProcesses(2) as worker:
         taken_s[0] = 1.0  # its imports
         child = await worker.gets("acme")
         taken_s[0] = 3.5

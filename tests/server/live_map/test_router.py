@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import struct
 import time
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from rse_pf.server.scheduling.command_queue import QueuedCommand
 from rse_pf.server.worker_context import Clocks, WorkerContext
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, Failure, Result, Update
-from rse_pf.wire.live_map import KeyframeRequest
 from tests.kit.fake_map_client import FakeLiveMapClient, FakeReader
 from tests.kit.worker_parts import quiet_log
 
@@ -117,38 +115,6 @@ async def a_router(now: list[float] | None = None) -> AsyncIterator[Parts]:
         assert parts.client.closed
 
 
-async def test_a_keyframe_goes_to_the_map_server_of_its_tenants_map_and_the_reply_comes_back() -> None:
-    async with a_router() as parts:
-        answer = await parts.ask("live-keyframe", keyframe(), connection=FakeReader("bob", tenant="acme"))
-
-        assert isinstance(answer, Result)
-        assert answer.reply == {"number": 1, "version": 1}
-        assert answer.server == "s-1"
-        [(tenant, name, robot, operation, payload, deadline_s)] = parts.client.asked
-        assert (tenant, name, robot, operation) == ("acme", "m", RobotId("acme", "bob"), "live-keyframe")
-        assert 4.0 < deadline_s <= 5.0
-        assert payload == KeyframeRequest(map="m", segment=0, number=0, keyframe=KEYFRAME)
-
-
-async def test_a_keyframe_arrives_the_same_from_json_and_from_messagepack() -> None:
-    async with a_router() as parts:
-        for number, sent in enumerate((KEYFRAME, base64.b64encode(KEYFRAME).decode())):
-            await parts.ask("live-keyframe", keyframe(number, keyframe=sent))
-
-        assert [asked[4].keyframe for asked in parts.client.asked] == [KEYFRAME] * 2
-        assert [asked[4].number for asked in parts.client.asked] == [0, 1]
-
-
-async def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_invalid_request() -> None:
-    async with a_router() as parts:
-        for _ in range(20):
-            answer = await parts.ask("live-keyframe", keyframe(5))
-
-            assert isinstance(answer, Failure)
-            assert (answer.code, answer.trace) == ("conflict", "t")
-            assert answer.hint
-
-
 HEAD_BYTES = 108
 FX_AT = HEAD_BYTES + 8 + 6
 """Where the keyframe holds the focal length fx: behind the head of block 1 and four numbers."""
@@ -189,15 +155,6 @@ async def test_an_invalid_keyframe_is_refused_before_it_reaches_a_map_server(cha
         assert isinstance(answer, Failure)
         assert (answer.code, bool(answer.hint)) == (code, True), answer
         assert parts.client.asked == []
-
-
-@pytest.mark.parametrize("payload", [None, 3, [], "m", {}])
-async def test_a_payload_of_another_form_is_a_bad_request(payload: Any) -> None:
-    async with a_router() as parts:
-        answer = await parts.ask("live-show", payload)
-
-        assert isinstance(answer, Failure)
-        assert answer.code == "bad-request"
 
 
 RIGHTS = [
@@ -259,18 +216,6 @@ async def test_a_map_begins_with_another_one_for_who_may_read_that(
         assert allowed or (isinstance(answer, Failure) and "maps:read/secret" in answer.message)
 
 
-async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
-    async with a_router() as parts:
-        parts.client.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}
-        connection = FakeReader()
-        connection.claims = claims("maps:live/b")
-
-        answer = await parts.ask("live-list", None, connection=connection)
-
-        assert isinstance(answer, Result)
-        assert answer.reply == {"maps": [{"name": "b"}]}
-
-
 async def test_a_map_server_that_does_not_answer_is_given_up_at_the_deadline() -> None:
     async with a_router() as parts:
         parts.client.answer = lambda operation, payload: None
@@ -292,29 +237,6 @@ async def test_while_the_map_server_changes_a_robot_gets_the_time_to_ask_again()
 
         assert isinstance(answer, Failure)
         assert (answer.code, answer.retry_after_ms) == ("busy", 300.0)
-
-
-async def test_a_defect_is_an_internal_failure_without_its_text() -> None:
-    async with a_router() as parts:
-
-        def broken(operation: str, payload: dict[str, Any]) -> dict[str, Any]:
-            raise ZeroDivisionError("secret")
-
-        parts.client.answer = broken
-
-        answer = await parts.ask("live-show", {"map": "m"})
-
-        assert isinstance(answer, Failure)
-        assert answer.code == "internal"
-        assert "secret" not in answer.message + answer.hint
-
-
-async def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_as_its_own() -> None:
-    async with a_router() as parts:
-        parts.client.answer = lambda operation, payload: None
-        parts.submit("live-show", {"map": "m"}, connection=FakeReader("r", tenant="acme"))
-
-        assert (parts.router.held, waiting(parts)) == (1, 0)
 
 
 async def test_more_bytes_than_one_worker_holds_are_busy() -> None:
@@ -460,17 +382,3 @@ async def test_commands_that_wait_for_map_servers_are_bounded_for_each_tenant() 
 
         assert len(parts.answers) == 4
         assert parts.router.held == 17
-
-
-async def test_closing_ends_what_waits() -> None:
-    async with a_router() as parts:
-        parts.client.answer = lambda operation, payload: None
-        parts.submit("live-show", {"map": "m"})
-        await asyncio.sleep(0)
-        parts.router.give_up()
-
-        with suppress(asyncio.CancelledError):
-            await parts.router.wait_closed()
-
-        assert parts.client.gave_up
-        assert parts.router.held == 0

@@ -5,12 +5,11 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import numpy as np
 import pytest
 
 from rse_pf.errors import Forbidden, RsePfError
 from rse_pf.server.live_map.subscriptions import Subscriptions
-from rse_pf.wire import CODECS, Failure, Update
+from rse_pf.wire import Failure, Update
 from tests.kit.fake_map_client import FakeReader
 from tests.kit.fakes import FakeLog, FakeLoop
 
@@ -51,34 +50,6 @@ def poses(reader: FakeReader) -> list[float]:
     return [update.payload["x"] for update in reader.written if update.key != "map"]
 
 
-def test_a_new_subscription_gets_the_present_value_of_every_key(parts: Parts) -> None:
-    early, late = FakeReader("a"), FakeReader("b")
-    parts.begin(early)
-    parts.pose("a", 1.0)
-    parts.pose("a", 2.0)
-    parts.settle()
-
-    parts.begin(late)
-    parts.settle()
-
-    assert received(late) == [(1, "map"), (2, "pose/a")]
-    assert poses(late) == [2.0]
-    assert parts.watched == [("default", "m")]
-
-
-@pytest.mark.parametrize("codec", CODECS)
-def test_every_codec_carries_the_same_value(parts: Parts, codec: str) -> None:
-    reader = FakeReader(codec=codec)
-    parts.begin(reader)
-    parts.all.update("default", "m", "alignment/r", {"T_map_odom": np.eye(4).ravel(), "cause": None})
-    parts.settle()
-
-    update = reader.written[-1]
-
-    assert (update.id, update.topic, update.key) == (7, "live/m", "alignment/r")
-    np.testing.assert_array_equal(update.payload["T_map_odom"], np.eye(4).ravel())
-
-
 def test_a_slow_reader_gets_the_newest_value_of_each_key_and_a_gap_in_the_numbers(parts: Parts) -> None:
     slow, fast = FakeReader("slow"), FakeReader("fast")
     parts.begin(slow)
@@ -116,36 +87,6 @@ def test_a_reader_that_never_reads_costs_the_names_of_the_keys_only(parts: Parts
     assert sys.getsizeof(subscription.unsent) < 100_000
 
 
-def test_values_that_come_together_replace_each_other_before_they_are_sent(parts: Parts) -> None:
-    reader = FakeReader()
-    parts.begin(reader)
-    parts.settle()
-
-    for step in range(5):
-        parts.pose("a", float(step))
-    parts.settle()
-
-    assert poses(reader) == [4.0]
-    assert received(reader)[-1][0] == 6
-
-
-def test_many_readers_are_served_in_several_rounds_of_the_event_loop(parts: Parts) -> None:
-    readers = [FakeReader(f"r{number}") for number in range(150)]
-    for reader in readers:
-        parts.begin(reader)
-    parts.settle()
-
-    parts.pose("a", 1.0)
-    parts.pose("b", 1.0)
-    parts.loop.now += 0.011
-    parts.loop.turn()
-    sent_at_once = sum(len(received(reader)) - 1 for reader in readers)
-    parts.settle()
-
-    assert sent_at_once == 200
-    assert all(len(received(reader)) == 3 for reader in readers)
-
-
 def test_another_tenants_map_of_the_same_name_is_another_map(parts: Parts) -> None:
     here, there = FakeReader("r"), FakeReader("r", tenant="other")
     parts.begin(here)
@@ -156,25 +97,6 @@ def test_another_tenants_map_of_the_same_name_is_another_map(parts: Parts) -> No
 
     assert poses(here) == []
     assert poses(there) == [1.0]
-
-
-def test_an_ended_subscription_gets_nothing_and_the_last_one_ends_the_watch(parts: Parts) -> None:
-    first, second = FakeReader("a"), FakeReader("b")
-    parts.begin(first)
-    parts.begin(second)
-    parts.settle()
-
-    parts.all.end(first, 7)
-    parts.pose("x", 1.0)
-    parts.settle()
-    assert (poses(first), poses(second)) == ([], [1.0])
-    assert parts.watched == [("default", "m")]
-
-    parts.all.end_all(second)
-    assert parts.watched == []
-    assert len(parts.all) == 0
-    parts.pose("x", 2.0)
-    parts.settle()
 
 
 def test_a_reader_that_is_slow_when_it_leaves_is_forgotten(parts: Parts) -> None:
@@ -220,11 +142,3 @@ def test_a_value_that_cannot_be_sent_is_logged_once_and_left_out(parts: Parts, v
 
     assert [[key for _, key in received(reader)] for reader in readers] == [["map", "pose/a"]] * 2
     assert [fields["key"] for level, _, fields in parts.log.events if level == "error"] == ["odd"]
-
-
-def test_the_socket_of_a_subscriber_holds_few_unsent_bytes(parts: Parts) -> None:
-    reader = FakeReader()
-
-    parts.begin(reader)
-
-    assert reader.max_unsent == 16_384

@@ -9,8 +9,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, WorkerLost
 from rse_pf.identity import RobotId
-from rse_pf.server.sandbox import circuit_breaker
-from rse_pf.server.sandbox.circuit_breaker import POISON_S, Block, CircuitBreaker
+from rse_pf.server.sandbox.circuit_breaker import CircuitBreaker
 
 SETTINGS = PlatformSettings.from_dict({"services": {"breaker_crashes": 3}}).services
 ONE, TWO, THREE, FOUR = (RobotId("acme", f"robot-{i}") for i in range(1, 5))
@@ -53,15 +52,6 @@ def test_a_request_that_crashed_twice_is_poison_for_its_robot_alone():
     assert refused(breaker, ONE, digest="b", now=200.0) == [""]
 
 
-def test_a_poison_request_is_tried_again_ten_minutes_after_its_crashes():
-    breaker = crashing([ONE, ONE], apart_s=0.0, digest="a")
-
-    assert refused(breaker, ONE, digest="a", now=POISON_S - 0.1) == ["poison"]
-    assert refused(breaker, ONE, digest="a", now=POISON_S) == [""]
-    breaker.note_crash(ONE, "icp", "a", POISON_S)
-    assert refused(breaker, ONE, digest="a", now=POISON_S) == [""], "one new crash is not enough"
-
-
 def test_three_crashes_in_half_a_minute_open_the_breaker_of_a_service_for_a_minute():
     breaker = CircuitBreaker(SETTINGS)
     for now, digest in ((0.0, "a"), (20.0, "b"), (30.0, "c")):
@@ -76,33 +66,6 @@ def test_three_crashes_in_half_a_minute_open_the_breaker_of_a_service_for_a_minu
     assert refused(breaker, ONE, now=90.0) == [""]
 
 
-def test_crashes_further_apart_do_not_open_the_breaker():
-    breaker = crashing([ONE] * 20, apart_s=15.1)
-
-    assert refused(breaker, ONE, now=20 * 15.1) == [""]
-
-
-def test_after_it_closed_the_breaker_needs_as_many_crashes_again():
-    breaker = crashing([ONE] * 3, apart_s=1.0)
-    breaker.note_crash(ONE, "icp", "late", 62.0)
-    breaker.note_crash(ONE, "icp", "later", 63.0)
-    assert refused(breaker, ONE, now=64.0) == [""]
-
-    breaker.note_crash(ONE, "icp", "last", 64.0)
-    assert refused(breaker, ONE, now=64.0) == ["worker-lost"]
-
-
-def test_crashes_before_the_breaker_opened_are_not_counted_twice_if_it_is_open_for_a_short_time(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(circuit_breaker, "OPEN_S", 1.0)
-    breaker = CircuitBreaker(SETTINGS)
-    for now in (0.0, 1.0, 2.0, 3.5):
-        breaker.note_crash(ONE, "icp", str(now), now)
-
-    assert refused(breaker, ONE, now=3.5) == [""]
-
-
 # --- deadlines -------------------------------------------------------------------------------------
 
 
@@ -115,18 +78,6 @@ def test_the_deadlines_of_robots_are_evidence_neither_against_a_service_nor_agai
     assert refused(breaker, FOUR, RobotId("rival", "x"), RobotId("new", "x"), now=600.0) == ["", "", ""]
     assert breaker.open_services(600.0) == []
     assert {block.reason for block in breaker.blocks(600.0)} == {"overruns"}
-
-
-def test_a_robot_whose_deadline_is_overrun_again_and_again_is_refused_the_service_and_told_why():
-    breaker = CircuitBreaker(SETTINGS)
-    for i in range(3):
-        breaker.note_overrun(ONE, "icp", float(i))
-
-    assert refused(breaker, ONE, TWO, NAMESAKE, now=3.0) == ["worker-lost", "", ""]
-    refusal = breaker.refusal(ONE, "icp", "a", 3.0)
-    assert refusal is not None
-    assert "longer deadline" in refusal.hint
-    assert refused(breaker, ONE, now=62.1) == [""]
 
 
 # --- several robots, several tenants ---------------------------------------------------------------
@@ -181,12 +132,6 @@ def test_a_service_is_refused_to_all_once_two_robots_outside_the_largest_tenant_
     ]
 
 
-def test_robots_of_one_name_in_three_tenants_are_three_robots():
-    breaker = crashing([RobotId(tenant, "robot-1") for tenant in ("a", "b", "c")])
-
-    assert refused(breaker, OTHER) == ["worker-lost"]
-
-
 def test_a_name_that_was_enrolled_again_has_nothing_of_its_predecessor():
     breaker = crashing([RobotId("acme", "robot-1", "old")] * 3)
 
@@ -194,41 +139,6 @@ def test_a_name_that_was_enrolled_again_has_nothing_of_its_predecessor():
 
 
 # --- the operator ----------------------------------------------------------------------------------
-
-
-def test_blocks_are_listed_with_reason_robots_and_time_and_those_of_most_robots_first():
-    breaker = crashing([ONE, TWO, THREE], digest="a")
-    breaker.note_crash(ONE, "icp", "a", 0.2)
-    for _ in range(3):
-        breaker.note_overrun(NAMESAKE, "pose", 0.2)
-
-    assert breaker.blocks(0.2) == [
-        Block(service="icp", reason="crashes", tenant="acme", robot=None, requests=0, left_s=60.0),
-        Block(service="icp", reason="poison", tenant="acme", robot=None, requests=1, left_s=599.9),
-        Block(service="icp", reason="poison", tenant="acme", robot="robot-1", requests=1, left_s=599.8),
-        Block(service="pose", reason="overruns", tenant="rival", robot="robot-1", requests=0, left_s=60.0),
-    ]
-    assert breaker.blocks(POISON_S + 1.0) == []
-
-
-def test_an_operator_lifts_everything_and_the_evidence_is_forgotten():
-    breaker = crashing([ONE, TWO, THREE, ONE, TWO, THREE], digest="a")
-    lifted = breaker.unblock(1.0)
-
-    assert {(block.reason, block.robot) for block in lifted} >= {("crashes", None), ("poison", "robot-1")}
-    assert breaker.blocks(1.0) == []
-    assert refused(breaker, ONE, digest="a") == [""]
-    breaker.note_crash(ONE, "icp", "a", 1.0)
-    assert refused(breaker, ONE, TWO, digest="a") == ["", ""]
-
-
-def test_an_operator_lifts_what_concerns_one_service():
-    breaker = crashing([ONE] * 3)
-    for i in range(3):
-        breaker.note_crash(ONE, "pose", str(i), 1.0)
-
-    assert [block.service for block in breaker.unblock(1.0, service="pose")] == ["pose"]
-    assert [block.service for block in breaker.blocks(1.0)] == ["icp"]
 
 
 def test_an_operator_lifts_what_concerns_one_tenant_or_one_robot():
@@ -243,22 +153,7 @@ def test_an_operator_lifts_what_concerns_one_tenant_or_one_robot():
     assert refused(breaker, *robots, digest="a") == ["", "", "poison"]
 
 
-def test_what_is_refused_to_all_is_not_lifted_for_one_tenant():
-    breaker = crashing([ONE, RIVAL, OTHER])
-
-    assert breaker.unblock(1.0, tenant="acme") == []
-    assert refused(breaker, FOUR) == ["worker-lost"]
-
-
 # --- memory ----------------------------------------------------------------------------------------
-
-
-def test_poison_expires_also_while_other_requests_crash():
-    breaker = CircuitBreaker(SETTINGS)
-    for now in (0.0, 0.0, 1e6):
-        breaker.note_crash(ONE, "icp", "old" if now == 0.0 else "new", now)
-
-    assert refused(breaker, ONE, digest="old", now=1e6) == [""]
 
 
 def test_the_oldest_requests_are_forgotten_when_ten_thousand_crashed():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +20,6 @@ from tests.kit.fakes import FakeLog, FakeLoop
 
 ROBOT, OTHER = RobotId("default", "r"), RobotId("acme", "r")
 """Two robots of one name."""
-CONNECTION = SimpleNamespace(robot=ROBOT)
 
 
 class Sandboxes:
@@ -115,21 +113,6 @@ def services(*names: str) -> list[InstalledService]:
     ]
 
 
-def test_the_former_services_answer_until_the_new_ones_are_ready() -> None:
-    parts = Parts("a")
-    parts.sandboxes.enter(CONNECTION)
-    parts.sandboxes.replace(services("a", "b"))
-
-    parts.call(1)
-    assert parts.made[0].held == 1
-    assert not parts.sandboxes.offers("b")
-
-    parts.made[1].on_ready(())
-    assert parts.sandboxes.offers("b")
-    assert parts.offered == [("a", "b")]
-    assert parts.made[1].robots == [ROBOT]
-
-
 def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() -> None:
     parts = Parts("a")
     parts.call(1)
@@ -153,20 +136,6 @@ def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() ->
         "counts of Prometheus never fall"
     )
     assert parts.sandboxes.report().cpu_s == {"sandboxes": {"acme": 3.0}}
-
-
-def test_a_service_that_was_removed_is_unknown_also_to_who_waited_for_it() -> None:
-    parts = Parts("a")
-    parts.call(1)
-    parts.sandboxes.replace([])
-
-    parts.call(2)
-    parts.made[0].reply()
-    parts.settle()
-
-    assert parts.answers == [(1, "ok"), (2, "unknown-service")]
-    assert parts.sandboxes.names == ()
-    assert parts.made[0].is_retired
 
 
 @pytest.mark.parametrize(
@@ -199,22 +168,6 @@ def test_services_that_never_get_ready_are_given_up_and_a_newer_list_replaces_th
     parts.made[2].on_ready(())
     parts.made[3].on_ready(())
     assert parts.sandboxes.names == ("d",)
-
-
-def test_nobody_waits_for_a_robot_that_has_left() -> None:
-    parts = Parts("a")
-    parts.sandboxes.enter(CONNECTION)
-    parts.call(1)
-    parts.sandboxes.replace(services("a"))
-    parts.made[1].on_ready(())
-    parts.call(2)
-
-    parts.sandboxes.leave(CONNECTION)
-    parts.settle()
-
-    assert parts.made[0].is_retired
-    assert parts.waiting() == 0
-    assert parts.made[1].queued == []
 
 
 def test_the_first_services_are_started_when_they_come_and_a_failure_of_the_start_is_told() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -55,20 +54,6 @@ def started(request: pytest.FixtureRequest) -> Iterator[Zygote]:
     assert zygote.report()[0]["event"] == "ready"
     yield zygote
     zygote.close()
-
-
-def test_a_sandbox_is_reported_with_a_descriptor_that_shows_its_end(started: Zygote) -> None:
-    channel = started.create(5)
-    report, (handle,) = started.report()
-
-    channel.close()
-
-    assert report == {"event": "created", "id": 5, "pid": report["pid"]}
-    assert select.select([handle], [], [], WAIT_S)[0] == [handle]
-    gone, _ = started.report()
-    assert gone["event"] == "gone"
-    assert gone["id"] == 5
-    os.close(handle)
 
 
 @pytest.mark.parametrize("started", [{"total_bytes": MIB}], indirect=True)

@@ -72,22 +72,6 @@ async def create(zygote: ZygoteClient, number: int) -> socket.socket:
     return ours
 
 
-async def test_a_sandbox_that_is_ended_is_reported_with_its_number_and_signal() -> None:
-    async with running_zygote() as (zygote, reports, _):
-        with await create(zygote, 7), await create(zygote, 8):
-            zygote.end(7)
-            zygote.end(7)
-
-            assert await reports.ends.get() == (7, "signal SIGKILL")
-
-
-async def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
-    async with running_zygote() as (zygote, reports, _):
-        (await create(zygote, 3)).close()
-
-        assert await reports.ends.get() == (3, "exit code 0")
-
-
 async def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
     async with running_zygote() as (zygote, reports, _):
         channel = await create(zygote, 3)

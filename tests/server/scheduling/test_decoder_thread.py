@@ -66,23 +66,3 @@ def test_a_robot_that_sent_undecodable_messages_comes_last_whatever_came_first(
 
     assert codec.decoded == [b"first", b"honest", b"honest too", b"suspect", b"worst"]
     assert decoder.unread_bytes == 0
-
-
-def test_a_codec_that_fails_costs_one_message(
-    loop: FakeLoop, decoder: DecoderThread, defects: list[Exception]
-):
-    class Defective(HeldCodec):
-        def decode_from_robot(self, data: bytes) -> Any:
-            raise KeyError(data)
-
-    codec: Any = Defective()
-    heard: list[Any] = []
-
-    for data in (b"first", b"second"):
-        decoder.begin(codec, data, number=1, suspicion=0, done=heard.append)
-        loop.run_until(lambda: len(heard) == len(defects))
-
-    loop.run_until(lambda: len(heard) == 2)
-    assert [each.code for each in heard] == ["bad-message", "bad-message"]
-    assert [repr(defect) for defect in defects] == ["KeyError(b'first')", "KeyError(b'second')"]
-    assert decoder.unread_bytes == 0

@@ -10,7 +10,7 @@ from tests.kit.fakes import FakeLoop
 BOUND_S = 0.0005
 
 
-class Bench:
+class DeferredRounds:
     """Deferred work on a loop of which a test runs single rounds; each step takes *step_s*."""
 
     def __init__(self, step_s: float) -> None:
@@ -37,41 +37,16 @@ class Bench:
         return seen
 
 
-def test_nothing_runs_while_it_is_added() -> None:
-    bench = Bench(0.0)
-
-    bench.work.add(bench.step, 1)
-
-    assert bench.done == []
-    assert len(bench.work) == 1
-
-
 def test_a_burst_is_divided_among_rounds_oldest_first() -> None:
-    bench = Bench(BOUND_S / 4)
+    bench = DeferredRounds(BOUND_S / 4)
     for number in range(10):
         bench.work.add(bench.step, number)
 
     assert bench.rounds() == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
 
 
-def test_a_step_longer_than_the_bound_is_the_only_one_of_its_round() -> None:
-    bench = Bench(BOUND_S * 2)
-    for number in range(3):
-        bench.work.add(bench.step, number)
-
-    assert bench.rounds() == [[0], [1], [2]]
-
-
-def test_what_a_step_adds_runs_in_a_later_round() -> None:
-    bench = Bench(0.0)
-    bench.work.add(lambda: bench.work.add(bench.step, 2))
-    bench.work.add(bench.step, 1)
-
-    assert bench.rounds() == [[1], [2]]
-
-
 def test_the_others_go_on_behind_a_step_that_fails() -> None:
-    bench = Bench(0.0)
+    bench = DeferredRounds(0.0)
 
     def fail() -> None:
         raise OSError

@@ -32,16 +32,6 @@ def test_one_robot_never_has_two_commands_running():
     assert second.command.id == 2
 
 
-def test_robots_of_one_name_in_two_tenants_are_queued_and_run_apart():
-    scheduler = AdmittedScheduler(max_queue=1)
-    assert scheduler.submit(queued("a", 1, stream="cam", seq=9, tenant="acme"), 0.0) == []
-    assert scheduler.submit(queued("a", 2, stream="cam", seq=1, tenant="rival"), 0.0) == []
-
-    both = [scheduler.start(0.0)[0] for _ in range(2)]
-
-    assert [(each.robot.tenant, each.command.id) for each in both if each] == [("acme", 1), ("rival", 2)]
-
-
 def test_an_older_frame_does_not_replace_a_newer_one():
     scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
@@ -67,43 +57,6 @@ def test_kept_frames_other_streams_and_no_stream_are_not_replaced(first, second)
     assert scheduler.submit(queued("a", 1, **first), 0.0) == []
     assert scheduler.submit(queued("a", 2, **second), 0.0) == []
     assert run_order(scheduler, 2) == [("a", 1), ("a", 2)]
-
-
-def test_streams_of_two_robots_do_not_meet():
-    scheduler = AdmittedScheduler(max_queue=4)
-    scheduler.submit(queued("a", 1, stream="cam"), 0.0)
-
-    assert scheduler.submit(queued("b", 2, stream="cam", seq=5), 0.0) == []
-
-
-def test_an_expired_command_costs_no_compute():
-    scheduler = AdmittedScheduler(max_queue=4)
-    scheduler.submit(queued("a", 1, within=0.03), 0.0)
-    scheduler.submit(queued("b", 2), 0.0)
-
-    started, refusals = scheduler.start(0.04)
-
-    assert started is not None
-    assert started.command.id == 2
-    assert [(r.queued.command.id, r.error.code) for r in refusals] == [(1, "expired")]
-
-
-def test_a_command_without_time_is_expired_at_once():
-    (refusal,) = AdmittedScheduler(max_queue=4).submit(queued("a", within=0.0), 0.0)
-
-    assert refusal.error.code == "expired"
-
-
-def test_one_robot_waits_with_a_bound():
-    scheduler = AdmittedScheduler(max_queue=4)
-    for identity in range(4):
-        scheduler.submit(queued("a", identity), 0.0)
-
-    (refusal,) = scheduler.submit(queued("a", 9), 0.0)
-
-    assert refusal.error.code == "busy"
-    assert refusal.error.retry_after_ms is not None
-    assert scheduler.submit(queued("b", 1), 0.0) == []
 
 
 def test_only_a_small_cheap_command_that_is_alone_runs_inline():
@@ -163,12 +116,3 @@ def test_a_frame_that_replaces_a_waiting_one_does_not_make_the_expected_wait_sho
 
     assert scheduler.backlog(queued("b", at=400.0, within=2.0)).pause_s > 0.0
     assert scheduler.backlog(queued("b", at=400.0, within=6.0)).pause_s == 0.0
-
-
-def test_the_age_of_the_oldest_command_is_reported():
-    scheduler = Scheduler()
-    assert scheduler.oldest_wait_s(5.0) == 0.0
-    scheduler.submit(queued("a", at=2.0))
-    scheduler.submit(queued("b", at=3.0))
-
-    assert scheduler.oldest_wait_s(5.0) == 3.0

@@ -20,19 +20,6 @@ def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, 
     assert work.started_s == now
 
 
-def test_nothing_starts_alone_while_another_command_waits_or_runs_or_when_it_is_too_late() -> None:
-    scheduler, first, second = Scheduler(), queued("a"), queued("b")
-    assert not scheduler.start_unqueued(queued("a", within=1.0), 1.0), "its deadline has passed"
-
-    scheduler.submit(first)
-    assert not scheduler.start_unqueued(second, 0.0), "the other one waits"
-    scheduler.start(0.0)
-    assert not scheduler.start_unqueued(second, 0.0), "the other one runs"
-
-    scheduler.done(first, 0.1)
-    assert scheduler.start_unqueued(second, 0.1)
-
-
 def test_services_that_answer_within_a_millisecond_stay_in_the_loop_although_others_wait() -> None:
     scheduler = Scheduler()
 

@@ -82,35 +82,6 @@ def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
     assert max(times.values()) - min(times.values()) <= 2, "those that were just read come last"
 
 
-def test_nothing_is_left_unread_once_there_was_time_for_all():
-    def scenario(poller, ours, theirs):
-        loop = asyncio.get_running_loop()
-        done = loop.create_future()
-
-        def on_readable(end: socket.socket) -> None:
-            left.discard(end)
-            end.recv(100)
-
-        def look() -> None:
-            unread.append(poller.leaves_unread())
-            if left or poller.leaves_unread():
-                loop.call_later(0.0, look)
-            else:
-                done.set_result(None)
-
-        left = set(ours)
-        for end in ours:
-            poller.add_reader(end.fileno(), partial(on_readable, end))
-        loop.call_soon(look)
-        return done
-
-    unread: list[bool] = []
-    run_scenario(scenario)
-
-    assert True in unread
-    assert unread[-1] is False
-
-
 def test_a_socket_that_another_one_ended_is_not_read():
     read: list[int] = []
 
@@ -133,41 +104,3 @@ def test_a_socket_that_another_one_ended_is_not_read():
     run_scenario(scenario)
 
     assert len(read) == 1
-
-
-def test_a_turn_that_ends_early_is_followed_by_others():
-    order: list[int] = []
-
-    def scenario(poller, ours, _):
-        done = asyncio.get_running_loop().create_future()
-
-        def on_readable(number: int) -> None:
-            order.append(number)
-            poller.remove_reader(ours[number].fileno())
-            if len(order) < 3 * SOCKETS:
-                poller.end_turn(lambda: poller.add_reader(ours[number].fileno(), lambda: on_readable(number)))
-            elif not done.done():
-                done.set_result(None)
-
-        for number, end in enumerate(ours):
-            poller.add_reader(end.fileno(), lambda number=number: on_readable(number))
-        return done
-
-    run_scenario(scenario)
-
-    times = Counter(order[: 2 * SOCKETS])
-    assert len(times) == SOCKETS
-    assert set(times.values()) == {2}
-
-
-def test_what_is_not_reading_is_the_loops():
-    def scenario(poller, ours, theirs):
-        done = asyncio.get_running_loop().create_future()
-        assert poller.remove_reader(ours[0].fileno()) is False
-        assert poller.create_future().done() is False
-        poller.add_writer(
-            theirs[0].fileno(), lambda: (poller.remove_writer(theirs[0].fileno()), done.set_result(None))
-        )
-        return done
-
-    run_scenario(scenario)

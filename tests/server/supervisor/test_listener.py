@@ -19,16 +19,6 @@ def test_a_server_on_loopback_needs_no_authentication(host: str) -> None:
     check_authentication(PlatformSettings.from_dict({**OPEN, "serving": {"host": host}}), None, False)
 
 
-def test_a_socket_is_bound_but_refuses_connections_until_it_listens() -> None:
-    with bound_socket("127.0.0.1", 0) as listener:
-        address = listener.getsockname()
-        with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(address)
-        listener.listen()
-        with pytest.raises(ConfigurationError, match="cannot listen on"):
-            bound_socket(*address)
-
-
 def test_the_hint_of_a_taken_port_names_the_setting_that_chooses_it() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

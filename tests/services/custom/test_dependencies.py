@@ -22,7 +22,6 @@ from rse_pf.services.custom.dependencies import (
     lock_dependencies,
     platform_tag,
     read_lock,
-    require_same_versions,
     tree_digest,
 )
 from rse_pf.services.custom.installed import install, installed_services, read_service
@@ -134,20 +133,6 @@ def test_what_is_not_locked_is_refused_with_its_line_and_how_to_lock_it(
     assert "rse-pf service lock" in told.value.hint
 
 
-def test_a_lock_may_continue_lines_and_hold_comments_extras_and_several_hashes(tmp_path: Path) -> None:
-    (tmp_path / "requirements.txt").write_text(
-        f"# head\nB.b[fast]==2.0 \\\n    {HASH} \\\n    {HASH}\n    # via a\n"
-        f"a==1.0 ; python_version > '3' {HASH}  # x\n"
-    )
-
-    assert [(each.name, each.version) for each in read_lock(tmp_path)] == [("a", "1.0"), ("b-b", "2.0")]
-
-
-def test_a_service_without_a_lock_has_no_packages(tmp_path: Path) -> None:
-    assert build_dependencies(tmp_path, tmp_path / "store") is None
-    assert not (tmp_path / "store").exists()
-
-
 def test_a_lock_holds_versions_and_hashes_and_the_wish_is_kept(
     built: tuple[Path, Path, Dependencies],
 ) -> None:
@@ -158,15 +143,6 @@ def test_a_lock_holds_versions_and_hashes_and_the_wish_is_kept(
     assert (service / "requirements.in").read_text() == "greeting>=1\n"
     assert (made.packages, made.platform) == ({"greeting": "1.2"}, platform_tag())
     assert made.folder.name == made.digest == tree_digest(made.folder)
-
-
-def test_packages_are_installed_once(
-    built: tuple[Path, Path, Dependencies], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    service, store, made = built
-    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("pip was run again"))
-
-    assert build_dependencies(service, store) == made
 
 
 def test_packages_that_were_changed_are_installed_again(
@@ -247,12 +223,6 @@ def test_packages_of_another_interpreter_are_refused(
 
     with pytest.raises(ConfigurationError, match=r"are for cp27-linux-sparc, this server is cp3"):
         installed_services(tmp_path)
-
-
-def test_two_services_of_one_server_agree_on_versions() -> None:
-    require_same_versions({"a": {"x": "1", "y": "2"}, "b": {"x": "1"}})
-    with pytest.raises(ConfigurationError, match="a needs x 1 and b needs x 2"):
-        require_same_versions({"a": {"x": "1"}, "b": {"x": "2"}})
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from rse_pf.services.custom.installed import (
     packaged_services,
     read_service,
 )
-from rse_pf.services.custom.runtime import open_runtime
 
 GOOD = {"name": "adder", "language": "python", "entry": "service.py"}
 
@@ -31,13 +30,6 @@ def folder(tmp_path):
     (made / "helper").mkdir()
     (made / "helper" / "more.py").write_text("y = 2\n")
     return made
-
-
-def test_a_service_is_read_from_its_manifest(folder):
-    service = read_service(folder)
-
-    assert (service.name, service.language, service.kind) == ("adder", "python", "stateless")
-    assert service.entry_path == folder / "service.py"
 
 
 @pytest.mark.parametrize(
@@ -75,17 +67,6 @@ def test_an_installed_service_runs_from_its_own_copy(folder, tmp_path):
     assert not (installed.folder / "requests").exists()
 
 
-def test_installing_again_replaces_every_file(folder, tmp_path):
-    install(folder, tmp_path / "services")
-    (folder / "helper" / "more.py").unlink()
-    (folder / "service.py").write_text("x = 3\n")
-    installed = install(folder, tmp_path / "services")
-
-    assert installed.entry_path.read_text() == "x = 3\n"
-    assert not (installed.folder / "helper" / "more.py").exists()
-    assert len(list((tmp_path / "services").iterdir())) == 1
-
-
 @pytest.mark.parametrize("harm", ["change", "add", "remove", "pins", "manifest"])
 def test_a_service_that_was_changed_after_its_installation_is_refused(folder, tmp_path, harm):
     place = install(folder, tmp_path / "services").folder
@@ -102,19 +83,6 @@ def test_a_service_that_was_changed_after_its_installation_is_refused(folder, tm
 
     with pytest.raises(ConfigurationError, match="install"):
         installed_services(tmp_path / "services")
-
-
-def test_a_library_that_was_not_built_is_one_line(folder, tmp_path):
-    (folder / "service.json").write_text(json.dumps({**GOOD, "language": "cpp", "entry": "build/lib.so"}))
-
-    with pytest.raises(UsageError, match="missing") as caught:
-        install(folder, tmp_path / "services")
-    assert "cmake" in caught.value.hint
-
-
-def test_a_missing_services_folder_is_one_line(tmp_path):
-    with pytest.raises(ConfigurationError, match="no services folder"):
-        installed_services(tmp_path / "none")
 
 
 PUBLISHED = """
@@ -141,13 +109,6 @@ def package(tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(tmp_path)
 
     return installed
-
-
-def test_a_package_publishes_a_service_by_an_entry_point(package, tmp_path):
-    package("doubling = doubling_for_tests")
-    (service,) = [each for each in packaged_services() if each.name == "doubling"]
-
-    assert open_runtime(service, tmp_path).call({"x": 21}).y == 42
 
 
 def test_a_published_service_with_a_bad_name_is_one_line(package):
@@ -195,19 +156,6 @@ def test_a_link_to_a_folder_is_not_followed(folder, tmp_path):
     with pytest.raises(UsageError, match="data is a link"):
         install(folder, tmp_path / "services")
     assert not list(tmp_path.rglob("services/**/key.json"))
-
-
-def test_a_folder_that_is_named_by_a_link_is_installed(folder, tmp_path):
-    (tmp_path / "name").symlink_to(folder)
-
-    assert install(tmp_path / "name", tmp_path / "services").name == "adder"
-
-
-def test_a_link_in_what_is_not_installed_is_no_matter(folder, tmp_path):
-    (folder / ".git").mkdir()
-    (folder / ".git" / "config").symlink_to("/etc/hostname")
-
-    assert install(folder, tmp_path / "services").name == "adder"
 
 
 def test_a_link_to_a_folder_that_was_added_after_the_installation_is_noticed(folder, tmp_path):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 
-from rse_pf.services.custom.output import MAX_LINE, OutputLines, format_output_line
+from rse_pf.services.custom.output import MAX_LINE, OutputLines
 
 
 def lines_of(*pieces: bytes, now: float = 0.0) -> list[str]:
@@ -21,14 +19,6 @@ def test_lines_are_the_same_however_the_pipe_cuts_them(size: int) -> None:
     pieces = [data[start : start + size] for start in range(0, len(data), size)]
 
     assert lines_of(*pieces) == ["one", "two é €", "", "  last without a newline"]
-
-
-def test_a_line_that_is_begun_comes_at_the_end_and_not_before() -> None:
-    output = OutputLines()
-
-    assert list(output.feed(b"begun", 0.0)) == []
-    assert list(output.end(0.0)) == ["begun"]
-    assert list(output.end(0.0)) == []
 
 
 def test_a_long_line_is_cut_and_says_how_much_is_missing() -> None:
@@ -57,14 +47,3 @@ def test_lines_are_bounded_per_second_and_those_left_out_are_counted() -> None:
     assert first == ["line"] * 200
     assert second == ["[800 lines were left out here: the service printed too fast]"] + ["later"] * 50
     assert list(output.end(1.0)) == ["[950 lines were left out here: the service printed too fast]"]
-
-
-def test_bytes_that_are_no_text_are_shown_as_such() -> None:
-    assert lines_of(b"\xff\xfe ok\r\n") == ["\ufffd\ufffd ok"]
-
-
-def test_a_line_is_shown_with_its_time_and_robot() -> None:
-    now = 1_700_000_000.25
-    clock = time.strftime("%H:%M:%S", time.localtime(now))
-
-    assert format_output_line(now, "robot-1", "hello") == f"{clock}.250  robot-1  | hello"

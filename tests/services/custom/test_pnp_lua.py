@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rse_pf.errors import BadRequest, DegenerateGeometry
+from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import pose_difference
 from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import make_problem
@@ -59,15 +59,6 @@ def test_it_agrees_with_the_platforms_solver_when_a_third_of_the_matches_is_wron
     assert abs(reply["inliers"] - len(ours.inliers)) <= 8
 
 
-def test_exact_matches_give_the_exact_pose(pnp_lua: Runtime) -> None:
-    request, problem = request_of(1, noise_px=0.0, outlier_ratio=0.0)
-
-    reply = pnp_lua.call(request)
-
-    np.testing.assert_allclose(np.reshape(reply["T_camera_world"], (4, 4)), problem.T_camera_world, atol=1e-8)
-    assert reply["rmse_px"] <= 1e-6
-
-
 def test_the_recorded_request_has_the_platforms_pose(pnp_lua: Runtime) -> None:
     recorded = json.loads((EXAMPLE / "requests" / "example.json").read_text())
     _, problem = request_of(3)
@@ -78,13 +69,6 @@ def test_the_recorded_request_has_the_platforms_pose(pnp_lua: Runtime) -> None:
     ours = solve_pnp(problem.points_world, problem.pixels, problem.camera)
     metres, degrees = pose_difference(np.reshape(reply["T_camera_world"], (4, 4)), ours.T_camera_world)
     assert (metres <= 0.01, degrees <= 0.2) == (True, True)
-
-
-def test_points_without_pixels_are_a_bad_request(pnp_lua: Runtime) -> None:
-    request, _ = request_of(1)
-
-    with pytest.raises(BadRequest, match="as many pixels"):
-        pnp_lua.call({**request, "pixels": []})
 
 
 def test_points_that_all_lie_in_one_place_are_degenerate(pnp_lua: Runtime) -> None:

@@ -95,25 +95,6 @@ def library(symbols: bytes = b"GLIBC_2.17\0", *, machine: int = 62) -> bytes:
     return b"\x7fELF\x02\x01" + bytes(12) + machine.to_bytes(2, "little") + symbols
 
 
-def test_a_published_service_arrives_as_it_was_installed(author: Author, server: PublishedFolder) -> None:
-    entry = author.publish(packages={"numbers": "1.0"})
-
-    (found,) = server.install(author.data(), author.fetch)
-
-    assert server.holds(author.data())
-    assert (found.name, found.identity) == ("adder", entry.identity)
-    assert (found.folder / "service.py").read_text() == "x = 1\n"
-    assert found.dependencies is not None
-    assert (found.dependencies / "numbers.py").read_text() == "y = 2\n"
-    assert [each.identity for each in installed_services(server.link.resolve())] == [entry.identity]
-
-
-def test_equal_files_give_an_equal_archive(author: Author) -> None:
-    first, second = author.publish(), author.publish()
-    assert (first.archive, first.identity) == (second.archive, second.identity)
-    assert author.publish(text="x = 2\n").archive != first.archive
-
-
 def test_a_new_list_replaces_the_former_at_once_and_fetches_only_what_is_new(
     author: Author, server: PublishedFolder
 ) -> None:
@@ -208,16 +189,6 @@ def test_an_archive_that_no_publisher_makes_is_refused(
     assert not [path for path in tmp_path.rglob("x") if path.parent.name != "adder"]
 
 
-def test_an_archive_with_another_digest_is_not_even_opened(author: Author, tmp_path: Path) -> None:
-    entry = author.publish()
-    changed = bytearray(author.fetch(entry))
-    changed[-1] ^= 1
-
-    with pytest.raises(ConfigurationError, match="is not the one in the list"):
-        unpack_archive(entry, bytes(changed), tmp_path / "into")
-    assert not (tmp_path / "into").exists()
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -263,11 +234,6 @@ def test_a_library_that_servers_cannot_load_is_refused_with_a_hint(
     assert read_list(author.store).services == ()
 
 
-def test_a_library_of_debian_12_is_taken(author: Author) -> None:
-    author.publish(libx_so=library(b"GLIBC_2.36\0GLIBCXX_3.4.30\0GLIBCXX_3.4\0"))
-    assert [each.name for each in read_list(author.store).services] == ["adder"]
-
-
 def test_packages_for_another_interpreter_or_of_two_versions_are_refused(author: Author) -> None:
     with pytest.raises(ConfigurationError, match="servers are cp311-linux-x86_64"):
         author.publish(packages={"numbers": "1.0", "platform": "cp312-linux-x86_64"})
@@ -302,13 +268,6 @@ def test_two_operators_who_publish_at_the_same_time_lose_nothing(author: Author)
     author.publish("mine")
 
     assert [each.name for each in read_list(author.store).services] == ["mine", "theirs"]
-
-
-def test_what_is_not_published_cannot_be_removed(author: Author) -> None:
-    author.publish()
-    with pytest.raises(UsageError, match="no service 'ader'") as told:
-        unpublish("ader", author.store)
-    assert "adder" in told.value.hint
 
 
 def test_a_server_that_dies_while_it_installs_begins_again(author: Author, server: PublishedFolder) -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from rse_pf.errors import (
     BadRequest,
-    CommandFailed,
     ConfigurationError,
     DegenerateGeometry,
     InternalError,
@@ -89,24 +88,6 @@ struct Adder {
   void restore(const std::string &data) { count = std::stoi(data); }
 };
 RSE_PF_SERVICE_WITH_SNAPSHOTS(Adder)
-"""
-C_BYTES = """
-#include <stdlib.h>
-#include <string.h>
-#include "rse_pf_service.h"
-uint32_t rse_pf_service_abi(void) { return ABI; }
-int rse_pf_service_open(const char *scratch, void **state) { *state = 0; return scratch[0] != '/'; }
-void rse_pf_service_close(void *state) { (void)state; }
-void rse_pf_service_free(void *state, void *memory) { (void)state; free(memory); }
-int rse_pf_service_call(void *state, const uint8_t *request, uint64_t size, uint8_t **reply,
-                        uint64_t *reply_size) {
-  (void)state;
-  if (memchr(request, '!', size)) return RSE_PF_FAILED;
-  *reply = malloc(size);
-  memcpy(*reply, request, size);
-  *reply_size = size;
-  return RSE_PF_OK;
-}
 """
 
 
@@ -202,41 +183,6 @@ def test_a_defect_of_a_script_is_an_internal_error_with_its_line(tmp_path):
 def test_a_service_that_cannot_be_loaded_is_one_line(tmp_path, language, entry, source, says):
     with pytest.raises(ConfigurationError, match=says):
         opened(tmp_path, language, entry, source)
-
-
-def test_a_script_has_no_access_to_python(tmp_path):
-    service = opened(
-        tmp_path, "lua", "service.lua",
-        "local json = require 'json'\nreturn function(r) return {p = tostring(python), ok = pcall(function() "
-        "return json.encode.__globals__ end)} end",
-    )  # fmt: skip
-
-    assert service.call({}) == {"p": "nil", "ok": False}
-
-
-def test_plain_c_may_take_json_bytes(tmp_path):
-    compiled(tmp_path, C_BYTES, "echo.c", "-DABI=RSE_PF_SERVICE_ABI")
-    service = opened(tmp_path, "cpp", "lib.so")
-
-    assert service.call({"a": [1, "é", None]}) == {"a": [1, "é", None]}
-    assert not service.has_snapshots
-    with pytest.raises(CommandFailed, match="returned the code 2 without a text"):
-        service.call({"a": "!"})
-
-
-def test_a_library_for_another_interface_is_refused(tmp_path):
-    compiled(tmp_path, C_BYTES, "echo.c", "-DABI=7")
-
-    with pytest.raises(ConfigurationError, match="interface 7"):
-        opened(tmp_path, "cpp", "lib.so")
-
-
-def test_a_library_without_a_call_is_refused_with_the_missing_name(tmp_path):
-    source = C_BYTES.replace("rse_pf_service_call", "something_else")
-    compiled(tmp_path, source, "echo.c", "-DABI=RSE_PF_SERVICE_ABI", "-Wno-missing-prototypes")
-
-    with pytest.raises(ConfigurationError, match="rse_pf_service_call"):
-        opened(tmp_path, "cpp", "lib.so")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from rse_pf.services.mapping.wifi import (
     AccessPointReading,
     Fingerprint,
     Locator,
-    WifiOptions,
     WifiReply,
     WifiRequest,
     fingerprint_of,
@@ -64,17 +63,6 @@ def test_sixty_eight_in_a_hundred_lie_inside_the_stated_radius() -> None:
     assert 0.63 <= np.mean(inside) <= 0.73
 
 
-def test_more_noise_gives_a_larger_radius() -> None:
-    radii = []
-    for noise_db in (1.0, 8.0):
-        building = make_building(1, noise_db=noise_db)
-        survey = [(each.position, each.rssi_dbm) for each in surveyed(building, 5, pitch_m=5.0)]
-        locator = Locator(survey, WifiOptions(grid_m=1.0))  # type: ignore[arg-type]
-        radii.append(np.median(located(building, locator, 20, 6)[1]))
-
-    assert radii[1] > 1.5 * radii[0]
-
-
 def test_the_service_answers_with_a_position_and_a_radius() -> None:
     building = make_building(2)
     scan = fingerprint_of(building.scan(np.array([10.0, 10.0, 0.3]), np.random.default_rng(1)), KEY)
@@ -113,15 +101,6 @@ def test_networks_that_opted_out_and_phones_never_leave_the_robot() -> None:
     assert len(found.rssi_dbm) == 1
 
 
-def test_names_depend_on_the_key_and_not_on_the_spelling() -> None:
-    spelt = AccessPointReading(mac="00:16:3E:0A:00:01", ssid="x", rssi_dbm=-50)
-    other = AccessPointReading(mac="00-16-3e-0a-00-01", ssid="x", rssi_dbm=-50)
-
-    assert fingerprint_of([spelt], KEY) == fingerprint_of([other], KEY)
-    assert fingerprint_of([spelt], KEY) != fingerprint_of([spelt], b"another team's key")
-    assert "00163e0a0001" not in str(fingerprint_of([spelt], KEY))
-
-
 @pytest.mark.parametrize(
     "scan",
     [{"00:16:3e:00:00:01": -50.0}, {"00163e000001": -50.0}, {"abc": 40.0}],
@@ -133,8 +112,3 @@ def test_hardware_addresses_and_impossible_strengths_are_refused(scan: dict[str,
 
     assert isinstance(answer, Failure)
     assert answer.code == BadRequest.code
-
-
-def test_a_short_key_is_refused() -> None:
-    with pytest.raises(BadRequest, match="key has 3 bytes"):
-        fingerprint_of([], b"abc")

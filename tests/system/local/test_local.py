@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -239,13 +238,3 @@ asyncio.run(run())
     for mark in marks:
         assert mark is not None
         assert wait_ended(mark, SOON_S)
-
-
-async def test_an_oversized_head_is_refused_at_the_door(tmp_path: Path) -> None:
-    def answer(port: int) -> bytes:
-        with socket.create_connection(("127.0.0.1", port), SOON_S) as robot:
-            robot.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nX-Fill: " + b"x" * 40_000 + b"\r\n\r\n")
-            return robot.recv(100)
-
-    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
-        assert (await asyncio.to_thread(answer, cloud.port)).startswith(b"HTTP/1.1 431")

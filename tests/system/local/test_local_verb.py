@@ -147,12 +147,6 @@ def test_stop_ends_a_platform_from_another_terminal(terminal: Terminal) -> None:
     assert_gone(state)
 
 
-def test_stop_without_a_platform_says_so(terminal: Terminal) -> None:
-    told = terminal.run("local", "stop")
-
-    assert (told.returncode, told.stdout) == (0, "platform 'default' was not running\n")
-
-
 def test_without_a_control_plane_robots_are_served_status_works_and_stop_cleans_up(
     terminal: Terminal,
 ) -> None:

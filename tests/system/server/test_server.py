@@ -93,17 +93,6 @@ async def test_rejected_handshakes_get_fixed_bodies(start_server):
     assert json.loads(body)["code"] == "full"
 
 
-def test_a_connection_header_with_two_values_is_accepted(start_server):
-    server = start_server()
-
-    head, _ = handshake(
-        server, connection="keep-alive, Upgrade", Sec_WebSocket_Protocol=f"chat, {SUBPROTOCOLS['json']}"
-    )
-
-    assert head.startswith("HTTP/1.1 101")
-    assert f"Sec-WebSocket-Protocol: {SUBPROTOCOLS['json']}" in head
-
-
 async def test_sockets_are_spread_evenly_over_the_workers(start_server):
     server = start_server(serving={"workers": 2})
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import base64
-import sys
 import time
-import types
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import client_sdk
-from client_sdk.tracing import current_trace, new_trace, traced
+from client_sdk.tracing import current_trace, traced
 from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
 from rse_pf.auth.tokens import SigningKey
@@ -42,16 +40,6 @@ def make(settings):
 
     return registry
 '''
-
-
-@pytest.fixture
-def span(monkeypatch: pytest.MonkeyPatch) -> str:
-    """A span of OpenTelemetry that is current, played by a module with its three functions."""
-    context = types.SimpleNamespace(is_valid=True, trace_id=0xABC, span_id=0xDEF, trace_flags=1)
-    module: Any = types.ModuleType("opentelemetry.trace")
-    module.get_current_span = lambda: types.SimpleNamespace(get_span_context=lambda: context)
-    monkeypatch.setitem(sys.modules, "opentelemetry.trace", module)
-    return f"00-{0xABC:032x}-{0xDEF:016x}-01"
 
 
 def of_function(trace: str) -> dict[str, Any]:
@@ -98,27 +86,3 @@ async def test_one_id_goes_from_the_robot_to_every_log(start_server: Any, tmp_pa
         ("command", "pnp"), ("command", "long"), ("job", "long"),
     }  # fmt: skip
     assert (function["service"], function["code"]) == ("pnp", "ok")
-
-
-def test_without_a_span_and_outside_of_traced_nothing_is_sent() -> None:
-    assert current_trace() == ""
-    with traced("mine") as trace:
-        assert current_trace() == trace == "mine"
-        with traced() as inner:
-            assert current_trace() == inner
-        assert current_trace() == "mine"
-    assert current_trace() == ""
-
-
-def test_a_span_of_opentelemetry_goes_on(span: str) -> None:
-    assert current_trace() == span
-    with traced("mine"):
-        assert current_trace() == "mine"
-
-
-def test_a_new_trace_is_a_traceparent_that_fits_the_message() -> None:
-    version, trace, parent, flags = new_trace().split("-")
-
-    assert (version, len(trace), len(parent), flags) == ("00", 32, 16, "01")
-    assert len(new_trace()) <= 64
-    assert new_trace() != new_trace()

@@ -34,14 +34,6 @@ def test_no_worker_holds_the_listener_or_a_channel_of_another(start_server):
         assert not held[one] & held[other], (one, other)
 
 
-def test_a_worker_has_a_name_of_its_own_and_reads_no_terminal(start_server):
-    server = start_server(serving={"workers": 1})
-    worker = Path(f"/proc/{server.workers[0]}")
-
-    assert (worker / "comm").read_text().strip() == "rse-pf worker"
-    assert os.readlink(worker / "fd/0") == os.devnull
-
-
 def test_services_that_are_not_there_are_said_before_any_worker_is_forked():
     with pytest.raises(ConfigurationError, match="no services at") as caught:
         serve(

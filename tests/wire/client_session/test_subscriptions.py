@@ -15,7 +15,7 @@ WELCOME = Welcome(
 )  # fmt: skip
 
 
-class Robot:
+class SubscribedSession:
     """A session, and the connections that a test gives it."""
 
     def __init__(self, codec: str = "json") -> None:
@@ -43,7 +43,7 @@ def update(identity: int, seq: int, key: str = "map", value: Any = None) -> Upda
 
 def test_a_subscription_is_asked_for_at_once_and_its_updates_are_events() -> None:
     for codec in CODECS:
-        robot = Robot(codec)
+        robot = SubscribedSession(codec)
         connection = robot.connect()
 
         identity = robot.session.subscribe("live/m", 0.0)
@@ -54,16 +54,8 @@ def test_a_subscription_is_asked_for_at_once_and_its_updates_are_events() -> Non
         ]
 
 
-def test_no_command_has_the_id_of_a_subscription() -> None:
-    robot = Robot()
-    identity = robot.session.subscribe("live/m", 0.0)
-
-    assert robot.session.submit("echo", {"value": 1}, now=0.0) == identity + 1
-    assert robot.session.subscribe("live/n", 0.0) == identity + 2
-
-
 def test_a_subscription_begins_again_on_the_next_connection() -> None:
-    robot = Robot()
+    robot = SubscribedSession()
     first = robot.connect()
     identity = robot.session.subscribe("live/m", 0.0)
     robot.said(first)
@@ -76,16 +68,8 @@ def test_a_subscription_begins_again_on_the_next_connection() -> None:
     assert robot.hear(second, update(identity, 1)) == [Updated(identity, "map", None)]
 
 
-def test_one_that_was_made_while_the_connection_was_lost_begins_on_the_next() -> None:
-    robot = Robot()
-
-    identity = robot.session.subscribe("live/m", 0.0)
-
-    assert robot.said(robot.connect(1.0)) == [Subscribe(id=identity, topic="live/m")]
-
-
 def test_after_a_move_only_the_new_connection_counts() -> None:
-    robot = Robot()
+    robot = SubscribedSession()
     old = robot.connect()
     identity = robot.session.subscribe("live/m", 0.0)
     new = robot.connect(1.0)
@@ -98,7 +82,7 @@ def test_after_a_move_only_the_new_connection_counts() -> None:
 
 
 def test_an_ended_subscription_is_said_and_later_updates_of_it_are_ignored() -> None:
-    robot = Robot()
+    robot = SubscribedSession()
     connection = robot.connect()
     identity = robot.session.subscribe("live/m", 0.0)
     robot.said(connection)
@@ -112,7 +96,7 @@ def test_an_ended_subscription_is_said_and_later_updates_of_it_are_ignored() -> 
 
 
 def test_a_refused_subscription_ends_and_is_not_asked_for_again() -> None:
-    robot = Robot()
+    robot = SubscribedSession()
     connection = robot.connect()
     identity = robot.session.subscribe("live/m", 0.0)
     failure = Failure(id=identity, code="forbidden", message="no")
@@ -123,7 +107,7 @@ def test_a_refused_subscription_ends_and_is_not_asked_for_again() -> None:
 
 
 def test_a_server_that_does_not_answer_is_asked_again_a_few_times() -> None:
-    robot = Robot()
+    robot = SubscribedSession()
     connection = robot.connect()
     identity = robot.session.subscribe("live/m", 0.0)
     robot.said(connection)
@@ -138,52 +122,10 @@ def test_a_server_that_does_not_answer_is_asked_again_a_few_times() -> None:
     assert [(each.id, each.failure.code) for each in ended] == [(identity, "unsupported")]
 
 
-def test_one_that_was_answered_is_not_asked_for_again() -> None:
-    robot = Robot()
-    connection = robot.connect()
-    identity = robot.session.subscribe("live/m", 0.0)
-    robot.hear(connection, update(identity, 1))
-    robot.said(connection)
-
-    assert robot.session.due(100.0) == []
-    assert robot.said(connection) == []
-
-
-def test_gaps_in_the_numbers_are_the_values_that_were_replaced() -> None:
-    robot = Robot()
-    connection = robot.connect()
-    identity = robot.session.subscribe("live/m", 0.0)
-
-    for seq in (1, 2, 7, 8):
-        robot.hear(connection, update(identity, seq))
-
-    assert robot.session.subscriptions.replaced == 4
-
-
 def test_an_update_of_another_topic_or_of_no_subscription_is_ignored() -> None:
-    robot = Robot()
+    robot = SubscribedSession()
     connection = robot.connect()
     identity = robot.session.subscribe("live/m", 0.0)
 
     assert robot.hear(connection, Update(id=identity, topic="live/other", seq=1)) == []
     assert robot.hear(connection, update(identity + 1, 1)) == []
-
-
-def test_subscriptions_count_towards_the_rate_of_the_robot() -> None:
-    robot = Robot()
-    connection = robot.connect()
-    before = connection.rate_limiter.available(0.0)
-
-    robot.session.subscribe("live/m", 0.0)
-
-    assert connection.rate_limiter.available(0.0) == before - 1
-
-
-def test_a_robot_that_gives_up_ends_its_subscriptions() -> None:
-    robot = Robot()
-    identity = robot.session.subscribe("live/m", 0.0)
-
-    [ended] = robot.session.abandon("unauthorized", "the token is wrong", "issue one")
-
-    assert isinstance(ended, SubscriptionEnded)
-    assert (ended.id, ended.failure.code, ended.failure.hint) == (identity, "unauthorized", "issue one")

@@ -35,12 +35,6 @@ def reason(admission: Admission, **changed: object) -> str:
     return "" if refusal is None else refusal.reason
 
 
-def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
-    assert reason(admission) == ""
-    assert reason(admission, claims=claims("services:*")) == ""
-    assert reason(admission, backlog=QueueBacklog(3)) == ""
-
-
 @pytest.mark.parametrize(
     ("changed", "expected", "code"),
     [
@@ -60,18 +54,6 @@ def test_a_command_beyond_a_limit_is_refused_for_its_reason(
     if code == "busy":
         assert refusal.error.retry_after_ms is not None
         assert 100.0 <= refusal.error.retry_after_ms <= 5000.0
-
-
-def test_of_several_reasons_the_first_in_order_is_told(admission: Admission):
-    everything = {
-        "queued": queued("r", within=0.0),
-        "claims": claims("data:read"),
-        "backlog": QueueBacklog(9, 1.0),
-    }
-
-    assert reason(admission, **everything) == "scope"
-    assert reason(admission, **{**everything, "claims": None}) == "expired"
-    assert reason(admission, backlog=QueueBacklog(9, 1.0)) == "robot-queue"
 
 
 def test_the_bytes_that_wait_for_the_decoder_are_bounded_and_suspects_get_a_quarter(admission: Admission):

@@ -69,27 +69,6 @@ def test_requests_that_come_with_their_sockets_are_judged_a_few_in_a_round(burst
     assert all(robot.recv(100).startswith(b"HTTP/1.1 404") for robot in burst.robots)
 
 
-def test_requests_that_come_later_together_are_judged_a_few_in_a_round(burst: Burst) -> None:
-    burst.take()
-    burst.loop.run_until(lambda: not burst.sockets.is_behind)
-    burst.longest_round()
-    for robot in burst.robots:
-        robot.sendall(REQUEST)
-
-    assert burst.longest_round() * HANDSHAKE_S <= ROUND_S
-    assert sorted(burst.ended) == list(range(50))
-
-
-def test_silent_sockets_that_leave_together_are_ended_a_few_in_a_round(burst: Burst) -> None:
-    burst.take()
-    burst.longest_round()
-    for robot in burst.robots:
-        robot.close()
-
-    assert burst.longest_round() * HANDSHAKE_S <= ROUND_S
-    assert sorted(burst.ended) == list(range(50))
-
-
 def test_silent_sockets_whose_time_is_over_together_are_ended_a_few_in_a_round(burst: Burst) -> None:
     burst.take()
     burst.longest_round()
@@ -97,17 +76,3 @@ def test_silent_sockets_whose_time_is_over_together_are_ended_a_few_in_a_round(b
 
     assert burst.longest_round() * HANDSHAKE_S <= ROUND_S
     assert sorted(burst.ended) == list(range(50))
-
-
-def test_a_request_that_comes_in_two_parts_is_judged(burst: Burst) -> None:
-    burst.take()
-    burst.longest_round()
-    burst.robots[7].sendall(REQUEST[:10])
-    burst.longest_round()
-    assert burst.ended == []
-    burst.robots[7].sendall(REQUEST[10:])
-    burst.longest_round()
-
-    assert burst.ended == [7]
-    burst.loop.advance(burst.parts.settings.session.hello_timeout_s)
-    assert len(burst.ended) == 50

@@ -14,7 +14,7 @@ from rse_pf.identity import RobotId
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.handshake import Accepted, HandshakeRequest
 from rse_pf.server.log import JsonLog
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Result, Welcome
+from rse_pf.wire import SUBPROTOCOLS, Failure, Hello, Renew, Welcome
 from tests.kit.fakes import FakeWire
 from tests.kit.worker_parts import UNIX_S, WorkerParts, quiet_log
 
@@ -98,15 +98,6 @@ def test_a_revocation_between_handshake_and_connection_ends_the_connection(worke
     assert [wire.closed for wire in wires] == [(4403, "revoked"), None]
 
 
-def test_a_revocation_ends_the_connections_of_its_robot_and_no_other(worker: Worker):
-    (_, mine), (_, other) = worker.robot(worker.token("r")), worker.robot(worker.token("s"))
-
-    worker.deny(DenyList().with_robot("default", "r", 0.0))
-
-    assert (mine.closed, other.closed) == ((4403, "revoked"), None)
-    assert worker.handshake.claims_or_problem(worker.token("r"), worker.clocks.wall()) == "disabled"
-
-
 def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(worker: Worker):
     (first, wire), (moving, other) = worker.robot(worker.token("r")), worker.robot(worker.token("s"))
     moving.move("rebalance", 3000.0, worker.loop.now)
@@ -121,18 +112,3 @@ def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(work
     assert worker.told == [{"event": "stays", "robot": RobotId("default", "s"), "number": moving.number}]
     worker.token_watch.replace(moving.number)
     assert other.closed == (4409, "replaced")
-
-
-def test_a_service_outside_of_the_scopes_is_forbidden_and_counted(worker: Worker):
-    (narrow, refused), (wide, answered) = (
-        worker.robot(worker.token("r", scopes=("services:pnp", "data:read"))),
-        worker.robot(worker.token("s", scopes=("services:*",))),
-    )
-    for connection in (narrow, wide):
-        worker.say(connection, Command(id=7, service="echo", payload={"value": 1}))
-    worker.loop.advance(0.01)
-
-    assert isinstance(refused.sent[-1], Failure)
-    assert (refused.sent[-1].id, refused.sent[-1].code) == (7, "forbidden")
-    assert worker.metrics.requests["echo", "forbidden"] == 1
-    assert isinstance(answered.sent[-1], Result)

@@ -55,16 +55,6 @@ def writer(taker: Taker) -> LogWriter:
     )
 
 
-async def test_an_entry_holds_no_more_than_four_mebibytes() -> None:
-    entries = writer(taker := Taker())
-    for number in range(5):
-        entries.submit(keyframe(number), 2 << 20)
-    running = asyncio.ensure_future(entries.run())
-    await entries.wait_empty()
-    running.cancel()
-    assert taker.sizes == [2, 2, 1]
-
-
 async def test_a_keyframe_too_many_is_refused_and_who_leaves_is_not() -> None:
     entries = writer(Taker())
     for number in range(1024):

@@ -23,7 +23,7 @@ from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.storage.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest
-from tests.kit.map_server_setup import MAP, Bench, settle
+from tests.kit.map_server_setup import MAP, MapServerSetup, settle
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 ONE, OTHER = RobotId("default", "one"), RobotId("default", "other")
@@ -131,18 +131,6 @@ def test_a_camera_that_makes_metres_of_kilometres_adds_no_point_far_away() -> No
     assert np.abs(points).max() <= 100.0
 
 
-def test_each_robot_has_its_share_of_a_map_with_many_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rse_pf.server.live_map.map_server.keyframe_objects._MAX_SOURCES", 10)
-    store = MemoryStore()
-    mine, theirs = stored(store, ONE, some_points(1.0)), stored(store, OTHER, some_points(3.0))
-    many = [source(OTHER, theirs) for _ in range(100)]
-
-    cloud = objects(store).build_cloud([*many, source(ONE, mine), source(ONE, mine)])
-
-    assert cloud.keyframes == 10
-    assert {round(float(z)) for z in cloud.points[:, 2]} == {1, 3}
-
-
 def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -180,7 +168,7 @@ def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
 
 async def test_a_forgotten_robots_points_are_in_no_later_version_and_not_in_the_store() -> None:
     store = MemoryStore()
-    bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0)
+    bench = MapServerSetup(store, implementation=LIVE_MAP, publish_pause_s=0.0)
     mine, late = stored(store, ONE, some_points(2.0)), some_points(2.5)
     theirs = stored(store, OTHER, some_points(3.0))
     arriving = ObjectReference(hashlib.sha256(late).hexdigest(), len(late))
@@ -211,7 +199,7 @@ async def test_a_version_names_images_where_the_operator_allows_them_and_forget_
     is_allowed: bool,
 ) -> None:
     store = MemoryStore()
-    bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
+    bench = MapServerSetup(store, implementation=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
     mine, theirs = stored(store, ONE, b"my image"), stored(store, OTHER, b"their image")
 
     server, maps = await bench.start("a"), MapRegistry(store, "default")
@@ -235,10 +223,10 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
     store = MemoryStore()
     maps, source = (
         MapRegistry(store, "default"),
-        Bench(MemoryStore(), implementation=LIVE_MAP, publish_pause_s=0.0),
+        MapServerSetup(MemoryStore(), implementation=LIVE_MAP, publish_pause_s=0.0),
     )
 
-    async def drive(bench: Bench, start: bool) -> None:
+    async def drive(bench: MapServerSetup, start: bool) -> None:
         server = await bench.start("a")
         if start:
             await server.ask("live-start", {"from": "origin"})
@@ -251,7 +239,7 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
     assert first.up is None
     origin = encode_map(dataclasses.replace(first, provenance={UP_FIELD: up}))
     maps.commit("origin", origin, parent=None, author="t", created_s=0.0)
-    bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0)
+    bench = MapServerSetup(store, implementation=LIVE_MAP, publish_pause_s=0.0)
 
     await drive(bench, True)
 
@@ -261,7 +249,7 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
 
 async def test_the_next_map_server_deletes_objects_that_the_last_one_could_not() -> None:
     store = MemoryStore()
-    bench = Bench(store, implementation=LIVE_MAP, lease_s=1.5)
+    bench = MapServerSetup(store, implementation=LIVE_MAP, lease_s=1.5)
     mine = stored(store, ONE, some_points(2.0))
 
     server = await bench.start("a")
@@ -273,39 +261,3 @@ async def test_the_next_map_server_deletes_objects_that_the_last_one_could_not()
     await settle()
 
     assert not list(store.list(f"objects/{ONE.folder}/"))
-
-
-def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
-    from rse_pf.live_map.events import KeyframeAdded, RobotForgotten
-    from rse_pf.live_map.live_map import LiveMap
-
-    live_map = LiveMap()
-    for robot in (ONE, OTHER):
-        reference = ObjectReference(hashlib.sha256(robot.name.encode()).hexdigest(), 10)
-        request = msgspec.msgpack.decode(keyframe_request(0, reference), type=KeyframeRequest)
-        live_map.apply(KeyframeAdded(robot=robot.folder, segment=0, number=0, data=request.keyframe))
-    live_map.apply(RobotForgotten(robot=ONE.folder))
-    parts = live_map.snapshot_parts()
-
-    restored = LiveMap.restore_parts(parts.head, lambda name: parts.parts[name] or b"")
-
-    assert [robot for robot, _ in restored.deletable_objects] == [ONE.folder]
-    assert restored.objects_of([1]) == live_map.objects_of([1]) != []
-    assert restored.digest() == live_map.digest()
-
-
-async def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -> None:
-    bench = Bench(implementation=LIVE_MAP)
-
-    server = await bench.start("a")
-    for number in range(5):
-        await server.map_server.answer(ONE, "live-keyframe", keyframe_request(number, None))
-    await settle()
-    shown = await server.ask("live-show", {"paths": True})
-    assert "paths" not in await server.ask("live-show")
-    assert [(path["robot"], path["segment"]) for path in shown["paths"]] == [("one", 0)]
-    assert np.allclose(shown["paths"][0]["points"], [[0.2 * n, 0, 0] for n in range(5)], atol=1e-3)
-    first_and_last = server.state.live_map.paths(2)[0][2][:, 0]
-    assert first_and_last[0] == 0.0
-    assert abs(first_and_last[-1] - 0.8) < 1e-9
-    assert len(first_and_last) == 3

@@ -18,9 +18,9 @@ from rse_pf.server.live_map.connection_security import (
     make_token,
 )
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, map_folder, next_action
-from rse_pf.server.live_map.map_server.log import LeaseLost, LiveLog, MapSnapshot, entries_between_snapshots
-from rse_pf.server.live_map.map_server.state import MapState, restore
-from rse_pf.storage.lease import Lease, read_record
+from rse_pf.server.live_map.map_server.log import LeaseLost, LiveLog, MapSnapshot
+from rse_pf.server.live_map.map_server.state import restore
+from rse_pf.storage.lease import Lease
 from rse_pf.storage.object_store import MemoryStore
 from tests.kit.fake_map import FAKE_MAP, FakeMap
 from tests.kit.map_server_setup import FOLDER, LEASE, HandClock
@@ -64,19 +64,6 @@ def test_a_map_is_taken_over_when_its_lease_has_ended(
     assert next_action(lease, unchanged_s=unchanged_s, lease_s=LEASE_S) == action
 
 
-def test_of_two_processes_that_claim_a_map_one_gets_it():
-    store, clock = MemoryStore(), HandClock()
-    first, second = leased(store, "a", clock), leased(store, "b", clock)
-
-    assert first.claim(None)
-    assert not second.claim(None)
-    assert second.claim(read_record(store, LEASE))
-    assert second.record.epoch == 2
-    assert not first.renew()
-    assert not first.release()
-    assert second.renew()
-
-
 def test_the_age_of_a_lease_counts_from_the_begin_of_its_last_write():
     store, clock = MemoryStore(), HandClock()
     lease = leased(store, "a", clock)
@@ -116,28 +103,6 @@ def test_a_map_server_that_finds_its_entry_number_taken_has_lost_the_lease():
     with pytest.raises(LeaseLost):
         old.write_entry(b"other")
     assert [entry.events for entry in log_of(store, 3).read_entries()] == [b"one", b"two"]
-
-
-def test_an_entry_whose_answer_was_lost_is_written_once():
-    store = MemoryStore()
-    log = log_of(store)
-    log.write_entry(b"one")
-    log.position = 0  # as if the reply of the store was lost
-
-    assert log.write_entry(b"one") == 1
-
-
-def test_a_missing_or_damaged_entry_ends_a_replay():
-    store = MemoryStore()
-    log = log_of(store)
-    for _ in range(3):
-        log.write_entry(b"x")
-    store.delete(f"{FOLDER}log/{2:012d}")
-    with pytest.raises(StoreError, match="entry 2 of the log is missing, but 3 is there"):
-        list(log_of(store).read_entries())
-    store.put(f"{FOLDER}log/{2:012d}", b"\xff")
-    with pytest.raises(StoreError, match="damaged"):
-        list(log_of(store).read_entries())
 
 
 def test_two_snapshots_are_kept_and_a_damaged_one_is_passed_over():
@@ -199,25 +164,6 @@ def test_an_old_map_server_deletes_no_part_of_a_snapshot_that_the_new_one_is_wri
     new.write_snapshot(half)
 
 
-def test_a_snapshot_whose_part_is_missing_is_passed_over():
-    store = MemoryStore()
-    log, state = log_of(store, keeps_all=True), MapState(FAKE_MAP.empty(), 0)
-    change = [MapServerChanged(owner="a", epoch=1)]
-    newest = ""
-    for _ in range(2):
-        state.apply(log.write_entry(encode_events(change)), change)
-        log.write_snapshot(state.make_snapshot(log.stored_parts))
-        (newest,) = log.stored_parts.values()
-    assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
-    store.delete(f"{FOLDER}features/{newest}")
-
-    assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
-
-
-def test_a_small_map_has_a_snapshot_after_40_entries_and_a_large_one_after_200():
-    assert [entries_between_snapshots(keyframes) for keyframes in (0, 100, 400, 10_000)] == [40, 40, 100, 200]
-
-
 def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
     store = MemoryStore()
     log = log_of(store, keeps_all=True)
@@ -233,17 +179,6 @@ def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
     store.delete(f"{FOLDER}log/{1:012d}")
     with pytest.raises(StoreError, match="entry 1 of the log is missing"):
         restore(log_of(store), kind)
-
-
-def test_a_log_that_experiments_replay_keeps_all_entries():
-    store = MemoryStore()
-    log = log_of(store, keeps_all=True)
-    for number in range(1, 7):
-        log.write_entry(b"x")
-        log.write_snapshot(MapSnapshot(position=number, unmeasured=(), head=b""))
-
-    assert len(list(store.list(f"{FOLDER}log/"))) == 6
-    assert len(list(store.list(f"{FOLDER}snapshot/"))) == 2
 
 
 @pytest.mark.parametrize("name", ["", "A", "a/b", "..", "x" * 65, "-a", "a b"])

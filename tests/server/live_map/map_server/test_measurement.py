@@ -15,7 +15,6 @@ from rse_pf.live_map.events import Event, LoopClosuresMeasured
 from rse_pf.server.live_map.map_server.environment import Urgency
 from rse_pf.server.live_map.map_server.measurement import (
     KeyframeMeasurer,
-    choose_candidate_count,
     optimise_in_child,
     optimise_in_process,
 )
@@ -62,15 +61,6 @@ class NotingMap(FakeMap):
     ) -> list[Callable[[], LoopClosuresMeasured]]:
         self.asked.append((keyframe, pieces, candidates))
         return [lambda: LoopClosuresMeasured(keyframe=keyframe)] * pieces
-
-
-def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> None:
-    counts = [choose_candidate_count(waiting) for waiting in range(40)]
-    assert counts[0] is None
-    limited = [count for count in counts if count is not None]
-    assert counts == [None] * (40 - len(limited)) + limited
-    assert limited == sorted(limited, reverse=True)
-    assert min(limited) >= 4
 
 
 async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
