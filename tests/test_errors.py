@@ -11,12 +11,10 @@ import pytest
 
 from rse_pf import errors
 from rse_pf.errors import (
-    CommandFailed,
     MissingExtra,
     RsePfError,
     error_from_code,
     error_of_system,
-    message_of,
 )
 
 CODES = {
@@ -90,15 +88,6 @@ def test_an_exception_shows_message_hint_and_the_address_of_its_code() -> None:
     ]
 
 
-def test_the_sentence_alone_is_what_is_passed_on() -> None:
-    assert message_of(errors.Busy("too much", hint="send less")) == "too much"
-    assert message_of(ValueError("no number")) == "no number"
-
-
-def test_an_unknown_code_of_a_newer_server_is_a_failed_command() -> None:
-    assert type(error_from_code("out-of-coffee", "later")) is CommandFailed
-
-
 def test_a_report_is_what_is_wrong_and_then_what_to_do() -> None:
     error = errors.TooFewCorrespondences(
         "got 3 correspondences, a pose needs at least 4", hint="loosen the matcher, or skip this frame"
@@ -108,10 +97,6 @@ def test_a_report_is_what_is_wrong_and_then_what_to_do() -> None:
         "TooFewCorrespondences: got 3 correspondences, a pose needs at least 4\n"
         "  hint: loosen the matcher, or skip this frame"
     )
-
-
-def test_a_report_without_a_hint_is_one_line() -> None:
-    assert errors.Busy("too much").report() == "Busy: too much"
 
 
 def test_a_missing_extra_names_the_extra_and_the_pip_command() -> None:
@@ -131,11 +116,6 @@ def test_a_checkout_that_is_not_installed_is_named_in_the_pip_command(
 
     assert MissingExtra("picows", "backend").hint == f"pip install -e '{repository}[backend]'"
     assert MissingExtra.command() == f"pip install -e '{repository}'"
-
-
-def test_the_base_and_several_extras_have_a_command() -> None:
-    assert MissingExtra.command() == "pip install rse-pf"
-    assert MissingExtra.command("demo", "maps") == "pip install 'rse-pf[demo,maps]'"
 
 
 @pytest.mark.parametrize("error", [errors.Busy("m", hint="h", retry_after_ms=1.0), MissingExtra("a", "b")])

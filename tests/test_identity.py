@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import itertools
 
-from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.auth.roster import EnrolledRobot
-from rse_pf.identity import RobotId, folders_of, object_name, shown_name, state_name
-from rse_pf.storage.object_store import is_name
+from rse_pf.identity import RobotId, folders_of, shown_name
 
 THUMBPRINT = "kPrK_qmxVWaYVA9wwBF6Iuo3vVzz7TxHCTwXBygrS4k"
 words = st.text(min_size=1, max_size=64)
@@ -25,17 +23,6 @@ def test_robots_that_differ_in_tenant_name_or_enrolment_share_no_folder():
     ]
 
     assert len({robot.folder for robot in robots}) == len(set(robots)) == len(robots)
-
-
-@given(robots, robots)
-def test_two_robots_have_one_folder_only_if_they_are_one(first: RobotId, second: RobotId):
-    assert (first.folder == second.folder) == (first == second)
-
-
-@given(robots)
-def test_every_robot_can_own_objects_and_states(robot: RobotId):
-    assert is_name(object_name(robot, "0" * 64))
-    assert is_name(state_name(robot, "counter"))
 
 
 def test_a_robot_is_written_without_the_default_tenant_unless_that_is_ambiguous():

@@ -91,13 +91,6 @@ def test_other_programs_names_of_a_model_are_known(name: str, model: str) -> Non
     assert found.name == model
 
 
-def test_a_model_that_nobody_knows_has_no_entry() -> None:
-    assert find_lens_model("fov") is None
-    assert find_lens_model("") is None
-    with pytest.raises(InvalidCamera, match="no lens model 'fov'"):
-        Lens(camera=CAMERA, model="fov")
-
-
 @pytest.mark.parametrize(
     ("model", "distortion"),
     [
@@ -119,9 +112,3 @@ def test_only_a_perspective_lens_without_distortion_is_a_pinhole() -> None:
     assert Lens(camera=CAMERA, distortion=(0.0,) * 5).is_pinhole
     assert not lens_of("radial-tangential").is_pinhole
     assert not Lens(camera=CAMERA, model="fisheye").is_pinhole
-
-
-def test_the_field_of_view_follows_the_projection() -> None:
-    camera = Camera(fx=100.0, fy=100.0, cx=100.0, cy=50.0, width=200, height=100)
-    assert Lens(camera=camera).field_of_view_deg == pytest.approx(90.0)
-    assert Lens(camera=camera, model="fisheye").field_of_view_deg == pytest.approx(np.degrees(2.0))

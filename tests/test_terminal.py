@@ -21,8 +21,6 @@ from rse_pf.terminal import (
     printable,
     show,
     show_error,
-    show_json,
-    show_page,
     show_progress,
 )
 
@@ -73,26 +71,12 @@ def test_text_of_every_language_stays(text: str) -> None:
     assert printable(text) == text
 
 
-@given(st.text(st.characters()))
-def test_nothing_is_left_to_obey_and_escaping_twice_changes_nothing(text: str) -> None:
-    shown = printable(text)
-
-    assert obeyed(shown) == []
-    assert printable(shown) == shown
-
-
 @given(st.dictionaries(st.text(), st.text(st.characters()), max_size=3))
 def test_a_line_of_a_log_holds_no_control_byte_and_reads_as_what_was_logged(fields: dict[str, str]) -> None:
     line = json_line(fields, encode)
 
     assert obeyed(line.decode()) == []
     assert json.loads(line) == fields
-
-
-def test_a_newline_in_a_name_cannot_make_a_line_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
-    show("robot-1\nok: all logs are intact", "second")
-
-    assert capsys.readouterr().out == "robot-1\\nok: all logs are intact\nsecond\n"
 
 
 def test_a_message_of_several_lines_cannot_pass_for_two_reports(capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,13 +110,6 @@ def test_an_error_without_a_hint_names_where_it_is_explained() -> None:
 )
 def test_a_number_and_its_noun_agree(number: int, noun: str, text: str) -> None:
     assert counted(number, noun) == text
-
-
-def test_json_and_pages_are_written_whole(capsys: pytest.CaptureFixture[str]) -> None:
-    show_json({"name": "\x7f\x1b\u202e", "at": 1}, indent=None)
-    show_page("one\n\ntwo\x1b\n")
-
-    assert capsys.readouterr().out == '{"name": "\\u007f\\u001b\\u202e", "at": 1}\none\n\ntwo\\x1b\n'
 
 
 def test_a_terminal_without_the_letters_gets_their_escapes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, Crashed
+from rse_pf.errors import Crashed
 from rse_pf.extensions.batch.cluster import DaskEngine, LocalCluster
 from rse_pf.extensions.batch.merge import BatchMerge
 from rse_pf.extensions.batch.parts import Part
@@ -69,20 +69,6 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
     whole = merge_versions(versions)
     for one, other in zip(found.merged.version.keyframes, whole.version.keyframes, strict=True):
         assert np.abs(one.T_world_camera - other.T_world_camera).max() < 1e-4
-
-
-def test_a_part_that_fails_is_one_error_with_a_hint(tmp_path: Path) -> None:
-    settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
-    cluster = LocalCluster(1)
-    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster)
-    try:
-        engine.start()
-        with pytest.raises(BadRequest, match="no kind of part") as caught:
-            engine.run([Part(kind="what", inputs=())], lambda _: None)
-    finally:
-        engine.close()
-        cluster.stop()
-    assert caught.value.hint
 
 
 def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(

@@ -101,36 +101,9 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
     assert allowed - 2 <= dials <= allowed + 1
 
 
-def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
-    timings = ConnectTimings()
-    backoff, now = _backoff(timings, Random(2)), 0.0
-    dials_until_s = []
-    while now < 30.0:
-        backoff.count_attempt(now)
-        dials_until_s.append(now)
-        now += backoff.pause_s(now, ANSWERED, is_move=True)
-
-    assert len(dials_until_s) <= 0.5 * DIAL_BURST + 0.5 * DIALS_PER_MINUTE + 1
-    backoff.reset()
-    for _ in range(DIAL_BURST // 2):
-        assert backoff.pause_s(now, ANSWERED) <= timings.reconnect_max_s
-        backoff.count_attempt(now)
-
-
 def test_a_server_that_dies_is_dialled_again_within_a_second():
     for seed in range(50):
         assert _backoff(ConnectTimings(), Random(seed)).pause_s(50.0, ANSWERED) <= 0.1
-
-
-def test_the_pauses_grow_to_a_bound_and_not_beyond():
-    timings = ConnectTimings()
-    backoff, now, pauses = _backoff(timings, Random(5)), 0.0, []
-    while now < 3600.0:
-        pauses.append(backoff.pause_s(now, ANSWERED))
-        now += pauses[-1]
-
-    assert max(pauses[-10:]) <= timings.reconnect_long_max_s
-    assert min(pauses[-10:]) >= 0.5 * timings.reconnect_long_max_s
 
 
 def test_robots_that_are_told_the_same_time_do_not_come_back_together():
@@ -150,17 +123,6 @@ def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance(
 
     assert min(pauses) >= 1.0
     assert 1.2 <= max(pauses) <= 1.25
-
-
-def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
-    timings = ConnectTimings()
-    for seed in range(20):
-        backoff, now = _backoff(timings, Random(seed)), 0.0
-        backoff.pause_s(now)
-        while now < 120.0:
-            now += backoff.pause_s(now, UNANSWERED)
-
-        assert backoff.pause_s(now, ANSWERED) <= timings.reconnect_max_s
 
 
 def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():

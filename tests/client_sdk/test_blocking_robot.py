@@ -37,13 +37,6 @@ def test_has_the_public_methods_of_the_robot():
     assert public(client_sdk.BlockingRobot) == public(client_sdk.Robot) - for_loops_only
 
 
-@pytest.mark.parametrize("method", ["call", "solve_pnp", "store_object", "close"])
-def test_takes_the_same_arguments_as_the_robot(method):
-    ours, theirs = (getattr(kind, method) for kind in (client_sdk.BlockingRobot, client_sdk.Robot))
-
-    assert inspect.signature(ours).parameters == inspect.signature(theirs).parameters
-
-
 def test_connects_with_the_same_arguments_as_the_robot():
     ours, theirs = client_sdk.connect_blocking, client_sdk.connect
 
@@ -56,13 +49,6 @@ def test_a_closed_robot_is_disconnected_and_may_be_closed_again(url):
         with pytest.raises(Disconnected):
             robot.call("echo", {})
     assert robot.stats.sent == 0
-
-
-def test_many_threads_share_one_robot(url):
-    with client_sdk.connect_blocking(url) as robot, ThreadPoolExecutor(6) as threads:
-        values = threads.map(lambda n: robot.call("echo", {"value": n}).reply["value"], range(60))
-
-        assert list(values) == list(range(60))
 
 
 def test_calls_and_raises_like_the_robot(url):

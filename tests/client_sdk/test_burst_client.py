@@ -14,7 +14,7 @@ import pytest
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import BurstSettings, PlatformSettings, SessionSettings
-from rse_pf.errors import Busy, Expired, NoConsensus, UsageError
+from rse_pf.errors import Busy, Expired, NoConsensus
 from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
@@ -117,15 +117,6 @@ async def test_a_robot_that_finds_no_server_at_all_asks_the_function_that_connec
             assert client.stats.unanswered == 0, "nothing is left to be sent later"
 
 
-async def test_after_the_loss_of_all_servers_the_last_welcome_still_counts():
-    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
-        platform.refusals = [(503, None)] * 1000
-        platform.sockets[0].cut()
-        await platform.until(lambda: len(platform.handshakes) > 1)
-
-        assert (await client.solve_pnp(*FRAME, deadline_s=5.0)).source == "burst"
-
-
 async def test_the_function_comes_before_the_robots_own_solver_and_the_solver_when_it_fails():
     async with FakeBurst() as burst, platform_with(burst) as platform, own_solver(platform) as client:
         platform.on_command = busy
@@ -183,29 +174,6 @@ async def test_a_frame_without_a_pose_is_not_solved_a_second_time():
         assert (len(burst.commands), client.stats.answered_by_robot) == (1, 0)
 
 
-async def test_other_services_and_robots_without_a_token_do_not_ask():
-    async with FakeBurst() as burst, platform_with(burst) as platform:
-        platform.on_command = busy
-        async with robot(platform.url) as client:
-            with pytest.raises(Busy):
-                await client.call("echo", {"value": 1}, deadline_s=1.0)
-        async with robot(platform.url, token=None) as client:
-            with pytest.raises(Busy):
-                await client.solve_pnp(*FRAME, deadline_s=1.0)
-
-        assert burst.commands == []
-
-
-async def test_the_user_may_turn_it_off():
-    async with FakeBurst() as burst, platform_with(burst) as platform:
-        platform.on_command = busy
-        async with robot(platform.url, burst_url="") as client:
-            with pytest.raises(Busy):
-                await client.solve_pnp(*FRAME, deadline_s=1.0)
-
-        assert burst.commands == []
-
-
 async def test_a_connection_is_kept_and_one_that_was_closed_meanwhile_costs_nothing():
     async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy
@@ -237,8 +205,3 @@ async def test_a_host_that_cannot_be_a_name_is_as_a_function_that_fails(host: st
         platform.on_command = busy
         with pytest.raises(Busy):
             await client.solve_pnp(*FRAME, deadline_s=5.0)
-
-
-def test_a_burst_address_that_cannot_be_used_is_refused_at_once():
-    with pytest.raises(UsageError, match="burst_url"):
-        client_sdk.connect("ws://127.0.0.1:8700/ws", burst_url="robots.example/burst")

@@ -65,57 +65,6 @@ def test_three_failures_in_a_row_open_the_breaker_and_one_trial_closes_it():
     assert breaker.may_send(0.8)
 
 
-def test_the_pause_doubles_and_is_never_longer_than_a_minute():
-    breaker, now, pauses_s = rules(), 0.0, []
-    breaker.may_send(now)
-    fail(breaker, now, 2)
-    for _ in range(8):
-        fail(breaker, now, jitter=1.0)
-        fail(breaker, now, 5)  # what was in flight fails by the same cause
-        opens = next(now + each for each in (1, 2, 4, 8, 16, 32, 60) if breaker.may_send(now + each))
-        assert not breaker.may_send(opens - 0.01)
-        pauses_s.append(opens - now)
-        now = opens
-
-    assert pauses_s == [1, 2, 4, 8, 16, 32, 60, 60]
-
-
-def test_a_function_that_asks_for_a_pause_gets_it():
-    breaker = rules()
-    breaker.may_send(0.0)
-    fail(breaker, 0.0, retry_after_s=30.0)
-
-    assert not breaker.may_send(29.0)
-    assert breaker.may_send(30.0)
-
-
-def test_a_cold_start_says_nothing_of_the_next_answer():
-    warm = rules()
-    warm.count_sent()
-    warm.count_answer(1.0, None)
-
-    assert warm.expected_s(1.0) == warm.first_s
-
-
-def test_a_slow_answer_is_forgotten_after_ten_seconds():
-    slow = rules()
-    slow.may_send(0.0)
-    slow.count_sent()
-    slow.count_answer(1.0, 1.5)
-
-    assert slow.expected_s(10.9) == 1.5
-    assert slow.expected_s(11.0) == slow.first_s
-
-
-def test_most_answers_decide_and_not_the_slowest():
-    mixed = rules()
-    for took_s in (0.02, 0.03, 0.03, 2.0):
-        mixed.count_sent()
-        mixed.count_answer(1.0, took_s)
-
-    assert mixed.expected_s(1.0) == 0.03
-
-
 @pytest.mark.parametrize(
     ("url", "own", "address"),
     [

@@ -17,7 +17,6 @@ from rse_pf.errors import (
     Expired,
     Forbidden,
     Unauthorized,
-    UnsupportedProtocol,
     UsageError,
 )
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER, MAX_BAD_MESSAGES
@@ -131,18 +130,6 @@ async def test_a_move_that_reaches_the_same_server_keeps_its_socket_and_is_retri
 
         assert (await ask(a_robot, 2)).server == "server-b"
         assert a_robot.stats.moves == 1
-
-
-async def test_a_robot_that_cannot_move_stays_until_the_move_ends():
-    async with FakePlatform() as platform, robot(platform.url) as a_robot:
-        await platform.sockets[0].move(within_ms=50)
-        await platform.until(lambda: len(platform.sockets) >= 2)
-        await platform.sockets[1].websocket.wait_closed()
-        answer = await ask(a_robot, 1)
-
-        assert answer.server == "server-a"
-        assert platform.sockets[0].is_open
-        assert a_robot.stats.moves == 0
 
 
 async def test_a_server_that_dies_during_a_move_loses_nothing():
@@ -275,14 +262,6 @@ async def test_what_a_firewall_refuses_ends_neither_a_connect_nor_a_robot():
         assert len(platform.handshakes) == 8
 
 
-async def test_a_missing_route_is_retried_once_the_robot_was_connected():
-    async with FakePlatform() as platform, robot(platform.url) as a_robot:
-        platform.refusals = [(404, None), (503, None), (400, None)]
-        platform.sockets[0].cut()
-
-        assert (await ask(a_robot, 1, deadline_s=10)).reply == {"value": 1}
-
-
 async def test_a_server_that_never_sends_welcome_is_a_connect_error():
     async with FakePlatform() as platform:
         platform.welcomes = False
@@ -313,13 +292,6 @@ def test_an_invalid_address_is_refused_before_anything_is_opened(url):
 def test_neither_an_address_nor_an_enrolment_is_refused_with_both_ways():
     with pytest.raises(UsageError, match="either an address or an enrolment"):
         robot("")
-
-
-def test_an_unknown_codec_is_refused_with_the_choices():
-    with pytest.raises(UsageError) as raised:
-        robot("ws://localhost/ws", codec="xml")
-
-    assert "zlib, json, bin" in raised.value.hint
 
 
 async def test_invalid_messages_of_a_server_affect_no_command_up_to_a_limit():
@@ -356,27 +328,6 @@ async def test_another_robot_with_the_same_token_is_told_as_a_conflict_and_tried
 
         assert (await answered(a_robot)).reply == {"value": 3}
         assert platform.handshakes[1] - platform.handshakes[0] >= 0.2
-
-
-async def test_a_robot_replaced_by_its_own_abandoned_attempt_reconnects():
-    """A server that was stopped accepts an abandoned attempt late, and closes the robot's present socket."""
-
-    async with FakePlatform() as platform, robot(platform.url) as a_robot:
-        platform.welcomes = False
-        await platform.sockets[0].move(within_ms=100.0)
-        await platform.until(lambda: len(platform.sockets) > 1 and not platform.sockets[1].is_open)
-        platform.welcomes = True
-        await platform.sockets[0].websocket.close(CLOSE_REPLACED, "replaced")
-
-        assert (await ask(a_robot, 1, deadline_s=5)).reply == {"value": 1}
-
-
-async def test_an_old_server_names_the_protocol_that_it_needs(monkeypatch):
-    monkeypatch.setattr("rse_pf.wire.server_session.PROTOCOL_VERSION", 99)
-
-    async with FakePlatform() as platform:
-        with pytest.raises(UnsupportedProtocol, match="protocol 1 is not 99"):
-            await robot(platform.url).__aenter__()
 
 
 async def test_reconnects_spread_over_the_whole_back_off(monkeypatch):

@@ -17,30 +17,6 @@ def plan(offload=None, **changes):
     return (offload or CloudFirst(slack_s=0.02)).plan(**{**values, **changes})
 
 
-def test_knows_nothing_yet_and_asks_the_cloud_with_the_robot_ready():
-    decided = plan(expected_round_trip_s=None, robot_solve_s=None)
-
-    assert decided.where == "both"
-    assert 0 < decided.robot_after_s < 0.2
-
-
-@given(deadline_s=seconds, mine_s=seconds, round_trip_s=st.none() | seconds, connected=st.booleans())
-def test_a_fallback_always_leaves_the_robot_its_time_or_starts_at_once(
-    deadline_s, mine_s, round_trip_s, connected
-):
-    decided = plan(
-        deadline_s=deadline_s, robot_solve_s=mine_s, expected_round_trip_s=round_trip_s, connected=connected
-    )
-
-    assert decided.robot_after_s == 0.0 or decided.robot_after_s + mine_s < deadline_s
-
-
-def test_the_faster_side_is_taken_only_when_asked_for():
-    assert plan(robot_solve_s=0.001).where == "both"
-    assert plan(CloudFirst(take_faster=True), robot_solve_s=0.001).where == "robot"
-    assert plan(CloudFirst(take_faster=True), robot_solve_s=0.06).where == "both"
-
-
 def test_the_robot_mends_what_the_cloud_broke_but_not_what_the_command_broke():
     assert CloudFirst.can_recover("busy")
     assert CloudFirst.can_recover("worker-lost")
@@ -60,25 +36,6 @@ def test_a_late_server_leaves_the_burst_function_its_time_before_the_robots_own(
     assert plan(burst_s=0.03, expected_round_trip_s=0.12).burst_after_s == pytest.approx(0.12)
     assert plan(burst_s=0.03, expected_round_trip_s=0.19).burst_after_s == pytest.approx(0.13)
     assert plan(burst_s=0.03, expected_round_trip_s=None).burst_after_s == pytest.approx(0.10)
-
-
-@pytest.mark.parametrize("changes", [{"connected": False}, {"expected_round_trip_s": 0.3}])
-def test_without_a_server_that_is_in_time_the_burst_function_is_asked_at_once_and_the_robot_last(changes):
-    decided = plan(burst_s=0.05, **changes)
-
-    assert (decided.burst_after_s, decided.robot_after_s) == (0.0, pytest.approx(0.16))
-    assert decided.where == ("both" if decided.why.startswith("the cloud takes") else "robot")
-
-
-def test_a_burst_function_that_cannot_be_in_time_is_not_asked():
-    assert plan(burst_s=0.17).burst_after_s is None
-    assert plan(burst_s=0.17, connected=False).robot_after_s == 0.0
-
-
-def test_a_robot_without_a_solver_has_two_places():
-    decided = plan(robot_can=False, burst_s=0.05, connected=False)
-
-    assert (decided.where, decided.burst_after_s) == ("cloud", 0.0)
 
 
 @given(

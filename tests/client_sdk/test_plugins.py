@@ -21,7 +21,6 @@ from client_sdk.plugins import (
     FoundFeatures,
     LoopsPlugin,
     OptimiserPlugin,
-    Plugins,
     load_features,
     load_function,
 )
@@ -85,29 +84,6 @@ def test_features_come_back_best_first() -> None:
         False,
         False,
     )
-
-
-def test_floats_become_int8_of_one_length_and_keep_their_angles() -> None:
-    vectors = np.abs(np.random.default_rng(1).standard_normal((50, 128))) * np.linspace(1, 90, 50)[:, None]
-
-    short = plugin_of(found(50, descriptors=vectors, scores=np.arange(50)[::-1]))(IMAGE).descriptors
-
-    assert short.dtype == np.int8
-    lengths = np.linalg.norm(short.astype(float), axis=1)
-    assert lengths.max() / lengths.min() < 1.03
-    unit = vectors / np.linalg.norm(vectors, axis=1)[:, None]
-    angles = np.degrees(np.arccos(np.clip((short / lengths[:, None] * unit).sum(axis=1), -1, 1)))
-    assert angles.max() < 3.0
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int8])
-def test_bytes_stay_as_they_are(dtype: type) -> None:
-    bytes_ = np.random.default_rng(1).integers(0, 100, (6, 40)).astype(dtype)
-
-    plugin = plugin_of(found(descriptors=bytes_, scores=np.arange(6)[::-1]))
-
-    assert np.array_equal(plugin(IMAGE).descriptors, bytes_)
-    assert plugin.kind == DescriptorKind("mine", np.dtype(dtype).name, 40)
 
 
 HOSTILE: dict[str, tuple[Any, str]] = {
@@ -392,12 +368,6 @@ def test_an_optimiser_must_return_all_poses_and_points(returned: Any, why: str) 
     with pytest.raises(UsageError, match=why) as refused:
         OptimiserPlugin(lambda *_: returned)(bundle, frame_at(0, depth=True).camera)
     assert "\n" not in refused.value.message
-
-
-def test_only_functions_are_plugins() -> None:
-    for plugin in ("motion", "loops", "optimiser"):
-        with pytest.raises(UsageError, match=f"{plugin}= takes a function, not a int"):
-            Plugins.wrap(**{plugin: 3})  # type: ignore[arg-type]
 
 
 # --- names on the command line -----------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
-from rse_pf.errors import ConnectError, Unauthorized, UsageError
+from rse_pf.errors import Unauthorized, UsageError
 from rse_pf.wire.server_session import CLOSE_REPLACED
 from tests.kit.delaying_proxy import DelayingProxy
 from tests.kit.fake_platform import FakePlatform, FakeSocket
@@ -167,24 +167,6 @@ async def test_a_region_that_gets_slow_is_left_without_a_gap_and_nothing_is_sent
         await regions.near.until(lambda: regions.near.open_sockets())
 
 
-async def test_a_region_that_is_away_at_the_start_is_joined_when_it_is_there():
-    async with TwoRegions() as regions:
-        await regions.near_link.die()
-        async with regions.robot() as a_robot:
-            assert (await ask(a_robot, 1)).server == "far-1"
-            await regions.near_link.listen()
-
-            await asked_until(a_robot, "near-1")
-
-
-async def test_no_region_at_all_is_one_connect_error():
-    async with TwoRegions() as regions:
-        await regions.near_link.die()
-        await regions.far_link.die()
-        with pytest.raises(ConnectError, match="cannot connect"):
-            await regions.robot().__aenter__()
-
-
 async def test_a_robot_that_one_region_does_not_know_uses_the_other_one():
     async with TwoRegions() as regions:
         regions.near.token, regions.far.token = "elsewhere", "mine"
@@ -195,14 +177,6 @@ async def test_a_robot_that_one_region_does_not_know_uses_the_other_one():
 
             with pytest.raises(Unauthorized):
                 await ask(a_robot, 2, deadline_s=10)
-
-
-async def test_a_robot_that_no_region_knows_is_told_so_at_once():
-    async with TwoRegions() as regions:
-        regions.near.token = regions.far.token = "elsewhere"
-        with pytest.raises(Unauthorized):
-            await regions.robot(token="mine").__aenter__()
-        assert len(regions.near.handshakes) == len(regions.far.handshakes) == 1
 
 
 async def test_two_addresses_of_one_platform_do_not_replace_each_other_for_ever():
@@ -230,17 +204,6 @@ async def test_a_server_that_asks_a_standby_to_move_gets_it_closed_and_the_comma
 
         assert (await ask(a_robot, 1)).server == "near-1"
         assert a_robot.stats.region_changes == 0
-
-
-async def test_a_blocking_robot_takes_several_addresses_too():
-    async with TwoRegions() as regions:
-
-        def drive():
-            urls = [regions.far_link.url, regions.near_link.url]
-            with client_sdk.connect_blocking(urls, settings=QUICK, timings=TIMINGS) as a_robot:
-                return a_robot.call("echo", {"value": 1}).server, a_robot.stats.region
-
-        assert await asyncio.to_thread(drive) == ("near-1", regions.near_link.url)
 
 
 @pytest.mark.parametrize("urls", [[], ["ws://a/ws", "ws://a/ws"], [f"ws://{n}/ws" for n in range(5)]])

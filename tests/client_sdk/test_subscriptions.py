@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 import client_sdk
-from client_sdk.commands.subscriptions import Updates
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
-from rse_pf.errors import Disconnected, Forbidden
+from rse_pf.errors import Forbidden
 from rse_pf.wire import CODECS
 from tests.kit.fake_platform import FakePlatform
 
@@ -106,27 +105,6 @@ async def test_a_refused_topic_is_a_typed_error_and_affects_nothing_else() -> No
             await refused.next()
         assert await granted.next() == ("map", 1)
         refused.close()
-
-
-async def test_a_robot_that_is_closed_ends_its_updates() -> None:
-    async with FakePlatform() as platform:
-        async with robot(platform) as a_robot:
-            updates = a_robot.subscribe("live/m")
-            waiting = asyncio.ensure_future(updates.next())
-            await subscribed(platform)
-        with pytest.raises(Disconnected):
-            await waiting
-        with pytest.raises(Disconnected):
-            a_robot.subscribe("live/m")
-
-
-async def test_values_that_nobody_reads_are_bounded() -> None:
-    updates = Updates("live/m", lambda: None)
-
-    for number in range(5000):
-        updates.put(f"pose/{number}", number)
-
-    assert await updates.next() == ("pose/904", 904)
 
 
 async def test_a_blocking_robot_iterates_without_asyncio() -> None:

@@ -87,26 +87,6 @@ def echo(message: dict[str, Any]) -> bytes | None:
     return said({"type": "result", "id": message["id"], "reply": message.get("payload")})
 
 
-def test_a_payload_that_has_no_json_is_a_typed_error_and_the_next_call_works() -> None:
-    program = """
-    const robot = await connect(url, { token: "t" });
-    const cycle = {};
-    cycle.itself = [cycle];
-    const wrong = [
-      10n, { deep: [1, 2n] }, new BigInt64Array(2), cycle, NaN, [1, -Infinity], new Float64Array([1, NaN]),
-      { toJSON() { throw new Error("of its own"); } },
-    ];
-    const codes = [];
-    for (const each of wrong) codes.push(await codeOf(robot.call("echo", each)));
-    for (const service of [10n, NaN]) codes.push(await codeOf(robot.call(service)));
-    codes.push((await robot.call("echo", { fine: [0.5, -0, 1e300], none: undefined })).reply.fine);
-    codes.push((await robot.call("echo", () => 1)).reply);
-    say([codes, robot.stats.unanswered, robot.error]);
-    """
-
-    assert against(echo, program) == [["usage"] * 10 + [[0.5, 0, 1e300], None], 0, None]
-
-
 def test_an_answer_that_cannot_be_read_ends_the_calls_that_wait_with_a_typed_error() -> None:
     def answers(message: dict[str, Any]) -> bytes | None:
         is_bad = message["type"] == "command" and message["payload"] == "bad"
@@ -267,48 +247,6 @@ def test_a_program_that_blocks_for_long_connects_again_and_sends_nothing_twice()
 
     assert against(answers, program) == ["ok", 0]
     assert len(commands) == 1
-
-
-STRICT = """
-// As in Node 22: what is no view of a buffer is refused where it is written, and the reader never hears it.
-const Stream = globalThis.DecompressionStream;
-globalThis.DecompressionStream = class {
-  constructor(format) {
-    const inner = new Stream(format);
-    const writer = inner.writable.getWriter();
-    this.readable = inner.readable;
-    this.writable = { getWriter: () => ({
-      write: async (chunk) => {
-        if (!ArrayBuffer.isView(chunk)) throw new TypeError("no view");
-        return writer.write(chunk);
-      },
-      close: () => writer.close(),
-    }) };
-  }
-};
-"""
-
-
-def test_a_message_in_an_array_buffer_is_read_where_streams_take_views_only() -> None:
-    data = list(said({"type": "move"}))
-    program = f"""{STRICT}
-    say(await codecs["json+zlib"].decode(Uint8Array.from({data}).buffer));
-    """
-
-    assert asyncio.run(printed(program)) == {"type": "move"}
-
-
-def test_a_stream_that_refuses_what_is_written_is_an_error_and_no_wait() -> None:
-    program = """
-    globalThis.DecompressionStream = class {
-      writable = { getWriter: () => ({ write: async () => { throw TypeError("no"); }, close: () => {} }) };
-      readable = { getReader: () => ({ read: () => new Promise(() => {}) }) };
-    };
-    const timer = setInterval(() => {}, 1000);
-    say(await codeOf(codecs["json+zlib"].decode(new Uint8Array(3))));
-    """
-
-    assert asyncio.run(printed(program)) == "TypeError"
 
 
 @pytest.mark.parametrize("size", [(1 << 20) + 1, 5_000_000])

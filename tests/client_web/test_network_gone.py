@@ -79,19 +79,6 @@ say({ gap, dials: dials.length, back_s: seconds() - from });
     assert told["back_s"] < told["gap"], "it did not wait for its next attempt"
 
 
-def test_a_page_gives_an_attempt_that_nobody_answers_more_time_than_the_first() -> None:
-    told = told_by("""
-be(true);
-globalThis.location = { host: "page.invalid" };
-await lose(() => {}, { connectTimeoutMs: 100 });
-await nextDial(5);
-await nextDial(5);
-say({ third: await nextDial(2), dials: dials.length });
-""")
-
-    assert told == {"third": None, "dials": 3}
-
-
 def test_in_node_an_attempt_whose_question_times_out_reached_nobody() -> None:
     told = told_by("""
 globalThis.fetch = async () => { throw new DOMException("late", "TimeoutError"); };

@@ -42,14 +42,6 @@ BUSY = {"code": "busy", "message": "too many commands wait"}
 OPEN = 'const robot = await connect(url, { token: "t" });\n'
 
 
-def test_a_refused_command_is_sent_again_after_the_pause() -> None:
-    server = Server({"type": "failure", "id": 1, "retry_after_ms": 300, **BUSY})
-    program = OPEN + "say([await codeOf(robot.call('echo', 1)), robot.stats.heldByBusy, robot.stats.resent]);"
-
-    assert against(server.answer, program) == ["ok", 1, 1]
-    assert server.pauses_s()[0] >= 0.28
-
-
 def test_after_busy_no_frame_of_its_stream_is_sent_before_the_pause_is_over() -> None:
     server = Server({"type": "failure", "id": 1, "retry_after_ms": 400, **BUSY})
     program = (

@@ -34,7 +34,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
-class Robot(FakeLiveRobot):
+class RobotWithLiveMaps(FakeLiveRobot):
     """A robot with live maps of its own making, as `client_sdk.Robot`."""
 
     def live_map(self, name: str, spool: Path) -> LiveMapper:
@@ -45,7 +45,7 @@ class Robot(FakeLiveRobot):
 class Recording:
     """Frames, during which the robot loses its connection after the first ones if it is told to."""
 
-    def __init__(self, robot: Robot, is_cut: bool) -> None:
+    def __init__(self, robot: RobotWithLiveMaps, is_cut: bool) -> None:
         self._robot, self._is_cut = robot, is_cut
 
     def thinned(self, rate: float) -> Iterator[Any]:
@@ -56,10 +56,10 @@ class Recording:
 
 
 def drive(example: ModuleType, monkeypatch: pytest.MonkeyPatch, *, is_cut: bool) -> str | None:
-    robot = Robot()
+    robot = RobotWithLiveMaps()
 
     @contextlib.asynccontextmanager
-    async def connect(**options: Any) -> AsyncIterator[Robot]:
+    async def connect(**options: Any) -> AsyncIterator[RobotWithLiveMaps]:
         yield robot
 
     monkeypatch.setattr(example, "connect", connect)

@@ -73,16 +73,6 @@ def test_tags_alone_are_found_where_they_were_found_with_objects(service: Runtim
     assert (alone[0].T_camera_object == service.call(request).found[1].T_camera_object).all()
 
 
-def test_an_image_without_objects_has_none(service: Runtime) -> None:
-    wall = cv2.resize(np.random.default_rng(1).integers(0, 256, (60, 80)).astype(np.uint8), (640, 480))
-
-    assert service.call(request_of(wall)).found == []
-
-
-def test_a_grey_image_has_none(service: Runtime) -> None:
-    assert service.call(request_of(np.full((480, 640), 128, np.uint8))).found == []
-
-
 @pytest.mark.parametrize(
     "wrong",
     [{"image": b""}, {"image": b"no image"}, {"camera": [525.0]}, {"camera": [0.0] * 4}, {"tag_m": 0.0}],

@@ -75,26 +75,6 @@ def test_the_slowest_body_gives_up_its_place_to_who_has_fewer(
         each.close()
 
 
-def test_no_body_gives_up_its_place_to_who_would_then_have_more(service: DataProcess) -> None:
-    slow = slow_bodies(service, "fourth", 6, 1)
-
-    assert put(service, "robot-1", "fourth") == (503, "1")
-
-    for each in slow:
-        each.close()
-
-
-def test_bodies_that_are_announced_without_a_token_take_no_memory(service: DataProcess) -> None:
-    before_mib = service.peak_memory_mib()
-    waiting = [begin_body(service, "", 8 << 20) for _ in range(100)]
-
-    assert put(service, "bystander", "default")[0] == 201
-    assert {each.recv(12) for each in waiting} == {b"HTTP/1.1 401"}
-    assert service.peak_memory_mib() - before_mib < 64
-    for each in waiting:
-        each.close()
-
-
 @pytest.mark.parametrize("size_mib", [5, 12, 30])
 def test_a_body_that_is_too_long_is_answered_when_it_was_sent(service: DataProcess, size_mib: int) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", service.port, timeout=SOON_S)

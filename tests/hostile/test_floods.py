@@ -249,14 +249,6 @@ def test_frames_that_the_protocol_forbids_end_their_own_connection_only(server):
     assert "defect" not in server.log
 
 
-async def test_a_long_request_head_is_answered_with_431(server):
-    reader, writer = await AttackTarget(server.url).open_tcp()
-    writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
-    answer = await asyncio.wait_for(reader.read(), 10)
-    writer.close()
-    assert answer.startswith(b"HTTP/1.1 431 ")
-
-
 async def test_equal_ids_and_streams_of_several_robots_are_kept_apart(server):
     target = AttackTarget(server.url)
     robots = [await target.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]

@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fuzz.damage import run_damaged
 from fuzz.meter import BARS, MAX_MIB, MAX_MS, Meter
@@ -40,13 +38,6 @@ def test_thousands_of_damaged_messages_give_a_message_or_a_protocol_error() -> N
 )
 def test_thousands_of_damaged_streams_keep_the_rules(target: str, inputs: int) -> None:
     assert fuzzed(target, seed=5, inputs=inputs).worst_mib < 1.0
-
-
-@given(data=st.binary(max_size=600))
-@settings(max_examples=150)
-def test_random_frames_keep_the_rules(data: bytes) -> None:
-    for target in ("frames", "stream"):
-        TARGETS[target](data, Meter())
 
 
 @pytest.mark.parametrize(

@@ -157,10 +157,6 @@ def test_an_edited_recording_is_a_report_or_one_line(
     )
 
 
-def test_an_honest_recording_is_a_report(tmp_path: Path, replay: LimitedReplay) -> None:
-    assert outcome(replay, written(tmp_path / "a")) == "report"
-
-
 @pytest.mark.parametrize(
     ("codec", "data"),
     [

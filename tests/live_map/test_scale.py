@@ -316,13 +316,6 @@ def test_a_loop_closure_measures_pose_and_scale(units_m: tuple[float | None, flo
     assert 0.015 < deviation < 0.06
 
 
-def test_loop_closures_in_metres_have_no_scale_and_their_earlier_bytes() -> None:
-    found = measure_loop_closures((0, features(0, None), CAMERA), [(1, features(1, None), CAMERA)])
-
-    assert found.links[0].scale is None
-    assert b"scale" not in encode_events([found])
-
-
 # --- Scales estimated together with poses ---
 
 

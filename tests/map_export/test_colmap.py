@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.colmap import encode_colmap
 from rse_pf.extensions.map_export.tracks import find_tracks
 from rse_pf.geometry import from_quaternion, inverse
@@ -74,15 +73,6 @@ def test_each_point_has_the_features_that_see_it_and_they_name_it() -> None:
             np.testing.assert_allclose(at, world[nearest.argmin()], atol=1e-5)
 
 
-def test_features_that_match_at_wrong_pixels_see_no_point() -> None:
-    version, _ = points_map(wrong=8)
-
-    tracks = find_tracks(version)
-
-    assert tracks.feature.min() >= 8
-    assert tracks.error_px.max() < 0.1
-
-
 def test_keyframes_far_apart_in_time_are_matched_where_an_edge_links_them() -> None:
     version, _ = points_map(keyframes=12)
     first, last = version.keyframes[0], version.keyframes[-1]
@@ -140,17 +130,6 @@ def test_absurd_points_and_poses_cost_only_their_own_features() -> None:
     assert np.isfinite(tracks.points).all()
     assert 4 not in tracks.keyframe
     assert not set(tracks.feature[tracks.keyframe == 0].tolist()) & set(range(10, 20))
-
-
-def test_maps_without_keyframes_or_matches_say_so_or_are_empty_models() -> None:
-    with pytest.raises(UsageError, match="no COLMAP model"):
-        encode_colmap(MapVersion(keyframes=()))
-    version, _ = points_map(keyframes=1)
-
-    files = encode_colmap(version)
-
-    assert rows_of(files, "points3D.txt") == []
-    assert len(rows_of(files, "images.txt")) == 2
 
 
 def test_pycolmap_reads_the_model_of_a_rendered_world(tmp_path: Path) -> None:

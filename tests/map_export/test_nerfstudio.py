@@ -8,12 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.nerfstudio import encode_nerfstudio
 from rse_pf.geometry import inverse, transform
-from rse_pf.maps.format import MapVersion
 from rse_pf.slam.ply import decode_ply
-from tests.kit.exact_maps import OTHER_CAMERA, points_map
+from tests.kit.exact_maps import points_map
 
 Row = Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -96,15 +94,6 @@ def test_a_frame_looks_along_minus_z_with_y_up() -> None:
     np.testing.assert_allclose(pixels[order], expected[np.argsort(expected[:, 0])], atol=1e-3)
 
 
-def test_several_cameras_stand_in_their_frames() -> None:
-    version, _ = points_map(cameras=(points_map()[0].keyframes[0].camera, OTHER_CAMERA))
-
-    found = valid(encode_nerfstudio(version))
-
-    assert found.fl_x is msgspec.UNSET
-    assert [frame.w for frame in found.frames] == [640, 600, 640, 600, 640]
-
-
 def test_a_map_that_knows_gravity_is_turned_so_that_z_points_up() -> None:
     version, _ = points_map(up=[0.0, -1.0, 0.0])  # y of the world points down, as in a first camera
     files = encode_nerfstudio(version)
@@ -129,14 +118,3 @@ def test_a_wrong_gravity_in_a_map_is_no_gravity(up: object) -> None:
 
     assert version.up is None
     assert valid(encode_nerfstudio(version)).applied_transform is msgspec.UNSET
-
-
-def test_a_map_without_points_has_no_cloud_and_one_without_keyframes_is_refused() -> None:
-    version, _ = points_map()
-
-    files = encode_nerfstudio(MapVersion(keyframes=version.keyframes))
-
-    assert list(files) == ["transforms.json"]
-    assert valid(files).ply_file_path is msgspec.UNSET
-    with pytest.raises(UsageError, match="without keyframes"):
-        encode_nerfstudio(MapVersion(keyframes=()))

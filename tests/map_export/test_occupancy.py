@@ -17,9 +17,9 @@ from rse_pf.extensions.map_export.occupancy import (
     encode_occupancy,
     make_occupancy_grid,
 )
-from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
+from rse_pf.geometry import Array, exp_se3, transform
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.slam.level_surfaces import floor_normal, level_surface_normal
+from rse_pf.slam.level_surfaces import floor_normal
 from tests.kit.exact_maps import CAMERA, shares_right, world_map
 
 UP = GridOptions(up=(0.0, 0.0, 1.0))
@@ -97,21 +97,6 @@ def test_without_gravity_up_is_found_across_the_floors_that_are_seen() -> None:
     assert np.degrees(np.arccos(up[2])) < 0.15
 
 
-def test_ramps_and_walls_do_not_tilt_what_is_level() -> None:
-    a, b = (each.ravel() for each in np.meshgrid(np.arange(0, 3, 0.02), np.arange(0, 3, 0.02)))
-    floor = np.column_stack([a, b, 0 * a])
-    ramp = np.column_stack([a - 4, b, np.tan(np.radians(20.0)) * a])[b < 1.5]
-    wall = np.column_stack([0 * a + 3, a, b])
-    points = np.concatenate([floor, ramp, wall]).astype(np.float32)
-    rough = np.array([np.sin(np.radians(8.0)), 0.0, np.cos(np.radians(8.0))])
-
-    up = level_surface_normal(points, rough)
-
-    assert up is not None
-    assert np.degrees(np.arccos(up[2])) < 0.1
-    assert level_surface_normal(wall.astype(np.float32), rough) is None
-
-
 def long_floor(tilt_deg: float, *, width_m: float = 4.0, step_m: float = 0.0) -> tuple[Array, Array]:
     """Return a tilted floor of 14 m with furniture on a third of it (0.4 to 0.8 m), and camera positions."""
     rng = np.random.default_rng(6)
@@ -146,16 +131,6 @@ def test_a_floor_that_tells_no_up_is_not_asked(floor: tuple[Array, Array]) -> No
     assert floor_normal(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places) is None
 
 
-def test_floor_is_free_obstacles_are_occupied_and_the_rest_is_unknown() -> None:
-    grid = make_occupancy_grid(room(), UP)
-
-    assert at(grid, 0.8, 0.8) == FREE
-    assert at(grid, 1.2, 3.2) == OCCUPIED
-    assert at(grid, 3.52, 1.0) == OCCUPIED
-    assert at(grid, 2.6, 3.0) == UNKNOWN  # only a ceiling is there
-    assert grid.floor_m == pytest.approx(0.0, abs=0.01)
-
-
 def test_a_look_frees_what_it_passes_at_the_height_of_the_robot_alone() -> None:
     grid = make_occupancy_grid(room(looks=np.array([[0.0, 0.0, 3.0]])), UP)
     above = make_occupancy_grid(room(looks=np.array([[0.0, -1.4, 2.2]])), UP)
@@ -176,26 +151,6 @@ def test_a_map_that_knows_gravity_is_turned_and_the_file_says_how() -> None:
     np.testing.assert_allclose(grid.T_grid_world @ down, np.eye(4), atol=1e-9)
     assert at(grid, 1.2, 3.2) == OCCUPIED
     assert b"# T_grid_world" in encode_occupancy(grid)["map.yaml"]
-
-
-def test_the_file_names_the_static_transform_of_ros() -> None:
-    T_grid_world = exp_se3([0.3, -1.2, 0.7, 0.4, -1.1, 2.0])
-    grid = replace(make_occupancy_grid(room(), UP), T_grid_world=T_grid_world)
-
-    (command,) = (
-        line
-        for line in encode_occupancy(grid)["map.yaml"].decode().splitlines()
-        if "static_transform" in line
-    )
-
-    words = command.split()
-    told = {
-        name: float(words[words.index(f"--{name}") + 1]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")
-    }
-    turn = from_quaternion([told[name] for name in ("qx", "qy", "qz", "qw")])
-    np.testing.assert_allclose(turn, T_grid_world[:3, :3], atol=1e-6)
-    np.testing.assert_allclose([told[name] for name in "xyz"], T_grid_world[:3, 3], atol=1e-6)
-    assert command.endswith("--frame-id plan --child-frame-id map")
 
 
 def test_the_files_are_those_of_map_server() -> None:

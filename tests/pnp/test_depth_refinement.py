@@ -84,26 +84,6 @@ def test_rows_without_depth_take_part_with_their_pixel():
     assert np.trace(with_all.covariance) < np.trace(with_half.covariance) < np.trace(solved(views).covariance)
 
 
-def test_without_any_depth_the_solution_stays_as_it_is():
-    views = two_views(4)
-    solution = solved(views)
-
-    found = refine_with_depth(
-        solution, views.points_reference, views.pixels, np.zeros(len(views.points_reference)), KINECT, _NOISE
-    )
-
-    assert found is solution
-
-
-def test_evidence_and_inliers_are_those_of_the_solver():
-    views = two_views(5)
-    before, after = solved(views), refined(views)
-
-    np.testing.assert_array_equal(after.inliers, before.inliers)
-    assert (after.verdict, after.reason, after.engine) == (before.verdict, before.reason, before.engine)
-    assert after.rmse_px == pytest.approx(before.rmse_px, rel=0.1)
-
-
 def test_a_fifth_of_wrong_depths_does_not_spoil_the_pose():
     views = [two_views(seed) for seed in range(40)]
     spoilt = [replace(each, depths_m=_with_wrong_depths(each.depths_m)) for each in views]
@@ -139,21 +119,6 @@ def test_the_noise_of_the_right_sensor_gives_the_smaller_error():
     )
 
     assert right < 0.9 * other
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"depths_m": np.zeros(3)},
-        {"depths_m": np.full(150, -1.0)},
-        {"depths_m": np.full(150, np.nan)},
-        {"depths_m": np.full(150, 1e9)},
-    ],
-    ids=["too-few", "negative", "nan", "absurd"],
-)
-def test_bad_depths_are_refused(change: dict[str, Array]):
-    with pytest.raises(BadRequest, match="depths_m"):
-        refined(replace(two_views(9), **change))
 
 
 def test_points_behind_the_reference_camera_are_refused():

@@ -119,24 +119,6 @@ def test_what_does_not_fit_is_refused(change: dict[str, Array]) -> None:
         refined(msgspec.structs.replace(problem(1, 50), **change))
 
 
-@pytest.mark.parametrize("row", [-1, 50, 2**62, -(2**62)])
-def test_row_numbers_outside_the_arrays_are_refused(row: int) -> None:
-    case = problem(1, 50)
-    inliers = np.array([0, 1, 2, 3, row])
-
-    with pytest.raises(BadRequest, match="row numbers"):
-        refined(
-            msgspec.structs.replace(case, solution=msgspec.structs.replace(case.solution, inliers=inliers))
-        )
-
-
-def test_without_inliers_the_pose_stays() -> None:
-    case = problem(1, 50)
-    none = msgspec.structs.replace(case.solution, inliers=np.empty(0, dtype=np.intp))
-
-    assert refined(msgspec.structs.replace(case, solution=none)) is none
-
-
 def test_absurd_numbers_give_a_finite_pose_or_an_error() -> None:
     rng = np.random.default_rng(5)
     for seed in range(300):

@@ -76,12 +76,6 @@ def test_without_a_pose_the_rules_say_why() -> None:
     ]  # fmt: skip
 
 
-def test_three_matches_break_the_only_rule_about_them() -> None:
-    problem = make_problem(seed=1, n=3, outlier_ratio=0.0)
-
-    assert [(rule.name, rule.is_satisfied) for rule in rules(problem, None)] == [("too-few", False)]
-
-
 def test_a_refused_pose_shows_the_rules_behind_the_first_that_refuses() -> None:
     problem = make_degenerate("duplicated", seed=1)
 

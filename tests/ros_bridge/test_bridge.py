@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk import connect
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import CAMERA_INFO, DIAGNOSTICS, IMAGE, POSE_WITH_COVARIANCE
 from client_sdk.frontend import Frame
@@ -22,7 +21,7 @@ from client_sdk.mapper import Mapper
 from ros_bridge import Bridge, BridgeOptions
 from ros_bridge.bridge import connected_bridge
 from ros_bridge.outgoing import Message
-from rse_pf.errors import ConnectError, Unauthorized, UsageError
+from rse_pf.errors import Unauthorized, UsageError
 from tests.kit.fake_live_map import solve
 from tests.kit.flat_world import frame_at
 from tests.kit.small_bags import raw_image
@@ -142,16 +141,6 @@ async def test_a_service_saves_the_map_into_the_folder_of_the_options(tmp_path: 
     }  # fmt: skip
 
 
-async def test_without_a_folder_or_a_connection_services_say_so() -> None:
-    heard = Heard()
-    async with running(heard) as bridge:
-        await drive(bridge, heard, 1)
-        assert (await bridge.save()).code == "usage"
-        assert (await bridge.call("pnp", "{}")).code == "disconnected"
-        for name in ("publish", "relocalise", "localise"):
-            assert (await bridge.triggers[name]()).code == "disconnected"
-
-
 async def test_diagnostics_count_what_was_left_out_and_say_why() -> None:
     heard = Heard()
     async with running(heard) as bridge:
@@ -196,15 +185,6 @@ async def test_a_frame_without_texture_is_counted_as_lost_and_the_next_one_goes_
     assert stamps == [0, 100_000_000, 300_000_000, 400_000_000]
 
 
-async def test_diagnostics_name_the_topic_of_depth_that_never_came() -> None:
-    heard = Heard()
-    async with running(heard, depth="/no/depth") as bridge:
-        send(bridge, frame_at(0, depth=True), 0, "info", "colour")
-        await heard.until(count_of(DIAGNOSTICS, 1))
-
-    assert heard.of(DIAGNOSTICS, MAKER)[0].status[0].message == "no new message of /no/depth"
-
-
 @pytest.mark.parametrize(
     ("content", "cause"), [(None, "No such file"), (b"", "it is empty"), (b"se\xffcret", "than ASCII")]
 )
@@ -238,12 +218,3 @@ async def test_diagnostics_and_one_line_say_why_there_is_no_connection_and_the_b
     said = "no connection to the platform: the token has expired"
     assert {each.status[0].message for each in heard.of(DIAGNOSTICS, MAKER)} == {said}
     assert said in "".join(capsys.readouterr())
-
-
-async def test_an_error_that_a_token_callable_raises_for_its_user_is_told() -> None:
-    async def token() -> str:
-        raise UsageError("cannot read the token in /a: it is empty", hint="write it")
-
-    with pytest.raises(ConnectError, match="no token: cannot read the token in /a: it is empty"):
-        async with connect("ws://127.0.0.1:1/ws", token=token):
-            pass

@@ -10,14 +10,13 @@ from client_sdk.bags.message_types import CAMERA_INFO, IMAGE
 from client_sdk.frontend import Frame
 from ros_bridge import BridgeOptions, IncomingFrames
 from ros_bridge.incoming import Role
-from ros_bridge.input_check import InputCheck
 from tests.kit.small_bags import camera_info, raw_image, scene, stamp_of
 
 SHOWN = scene()
 MS = 1_000_000
 
 
-class Robot:
+class MessageStream:
     """The messages of a robot, as bytes of ROS 1 or CDR, into what is tested."""
 
     def __init__(self, *, is_ros1: bool = True, **options: object) -> None:
@@ -50,7 +49,7 @@ class Robot:
 
 @pytest.mark.parametrize("is_ros1", [True, False])
 def test_a_frame_has_the_pixels_the_depth_and_the_stamp_of_its_messages(is_ros1: bool) -> None:
-    robot = Robot(is_ros1=is_ros1)
+    robot = MessageStream(is_ros1=is_ros1)
 
     assert not robot.colour(stamp_of(1), 1)
     assert robot.depth(stamp_of(1), 1)
@@ -66,7 +65,7 @@ def test_a_frame_has_the_pixels_the_depth_and_the_stamp_of_its_messages(is_ros1:
 
 
 def test_colours_take_the_nearest_depth_and_wait_while_a_nearer_one_may_come() -> None:
-    robot = Robot()
+    robot = MessageStream()
     stamp = stamp_of(0)
 
     robot.depth(stamp - 8 * MS, 0)
@@ -79,7 +78,7 @@ def test_colours_take_the_nearest_depth_and_wait_while_a_nearer_one_may_come() -
 
 
 def test_colours_without_depth_within_the_bound_are_left_out_and_counted() -> None:
-    robot = Robot(pair_within_s=0.01)
+    robot = MessageStream(pair_within_s=0.01)
 
     robot.colour(stamp_of(0))
     robot.depth(stamp_of(0) + 30 * MS)
@@ -91,7 +90,7 @@ def test_colours_without_depth_within_the_bound_are_left_out_and_counted() -> No
 
 
 def test_frames_leave_in_the_order_of_their_stamps_and_late_ones_are_counted() -> None:
-    robot = Robot()
+    robot = MessageStream()
     for stamp in (stamp_of(1), stamp_of(0)):
         robot.colour(stamp)
     for stamp in (stamp_of(0), stamp_of(1)):
@@ -103,7 +102,7 @@ def test_frames_leave_in_the_order_of_their_stamps_and_late_ones_are_counted() -
 
 
 def test_a_bag_that_is_played_again_gives_frames_again() -> None:
-    robot = Robot(queue_frames=10)
+    robot = MessageStream(queue_frames=10)
     for row in (0, 1, 2, 3):
         robot.colour(stamp_of(row) + 10 * row * MS)
         robot.depth(stamp_of(row) + 10 * row * MS)
@@ -118,35 +117,9 @@ def test_a_bag_that_is_played_again_gives_frames_again() -> None:
     assert robot.frames.check.left_out == {"without partner": 0, "before the clock jumped back": 1}
 
 
-def test_the_oldest_frame_is_dropped_where_too_many_wait() -> None:
-    robot = Robot(queue_frames=2, depth="")
-    for row in range(4):
-        robot.colour(stamp_of(row))
-
-    assert robot.taken() == [stamp_of(2), stamp_of(3)]
-    assert robot.frames.check.left_out["too fast"] == 2
-
-
-def test_without_depth_each_colour_image_is_a_frame() -> None:
-    robot = Robot(depth="")
-    assert robot.colour(stamp_of(0))
-    frame = robot.frame()
-    assert frame is not None
-    assert not frame.depth_m.any()
-
-
-def test_images_that_wait_for_depth_are_bounded() -> None:
-    robot = Robot()
-    for number in range(100):
-        robot.colour(stamp_of(0) + number * MS)
-
-    assert robot.taken() == []
-    assert robot.frames.check.left_out["without partner"] == 70
-
-
 @pytest.mark.parametrize("cut", [0, 3, 40, 2000])
 def test_a_broken_message_is_counted_and_the_next_one_is_taken(cut: int) -> None:
-    robot = Robot(depth="")
+    robot = MessageStream(depth="")
     whole = robot.maker.encode(IMAGE, raw_image(robot.maker, stamp_of(0), SHOWN.colours[0], "rgb8"))
 
     assert not robot.frames.add("colour", whole[:cut])
@@ -157,31 +130,13 @@ def test_a_broken_message_is_counted_and_the_next_one_is_taken(cut: int) -> None
 
 
 def test_a_topic_of_the_wrong_content_says_so() -> None:
-    robot = Robot()
+    robot = MessageStream()
     robot.send("colour", raw_image(robot.maker, stamp_of(0), SHOWN.depths_mm[0], "16UC1"))
     assert "holds depth, where colour is expected" in robot.frames.check.fault
 
 
-def test_frames_before_any_camera_info_are_left_out() -> None:
-    robot = Robot(depth="")
-    robot.frames._cameras.clear()
-    robot.colour(stamp_of(0))
-    assert robot.frame() is None
-    assert "no camera_info" in robot.frames.check.fault
-
-
-def test_a_lens_with_distortion_is_undistorted() -> None:
-    robot = Robot(depth="")
-    robot.frames._cameras.clear()
-    robot.send("info", camera_info(robot.maker, stamp_of(0), (0.3, -0.1, 0.0, 0.0, 0.0)))
-    robot.colour(stamp_of(0))
-    frame = robot.frame()
-    assert frame is not None
-    assert not np.array_equal(frame.rgb, SHOWN.colours[0])
-
-
 def test_a_topic_that_lags_behind_when_the_bag_begins_again_hides_no_partner() -> None:
-    robot = Robot(queue_frames=10)
+    robot = MessageStream(queue_frames=10)
     for row in (0, 1, 20):
         robot.colour(stamp_of(row))
         robot.depth(stamp_of(row))
@@ -203,7 +158,7 @@ def with_lens(maker: MessageMaker, fx: float, **other: object) -> object:
 
 
 def test_images_of_a_camera_info_that_changed_are_mapped_to_the_first_one_and_it_is_named() -> None:
-    robot = Robot(depth="")
+    robot = MessageStream(depth="")
     robot.send("info", with_lens(robot.maker, 96.0))
     robot.colour(stamp_of(0), 0)
     robot.colour(stamp_of(1), 1)
@@ -235,7 +190,7 @@ def test_a_camera_info_that_cannot_be_used_is_named_and_its_images_are_left_out(
 ) -> None:
     if is_first and "width" in other:
         named = "do not fit the camera_info of 32x24 px"
-    robot = Robot(depth="")
+    robot = MessageStream(depth="")
     if is_first:
         robot.frames = IncomingFrames(robot.maker, BridgeOptions.of({"depth": ""}))
     robot.send("info", camera_info(robot.maker, stamp_of(0), **other))  # type: ignore[arg-type]
@@ -248,7 +203,7 @@ def test_a_camera_info_that_cannot_be_used_is_named_and_its_images_are_left_out(
 
 @pytest.mark.parametrize(("stamps", "named"), [([0, 0], "is not set"), ([5, 5], "stands still at")])
 def test_images_whose_stamps_give_no_order_are_named(stamps: list[int], named: str) -> None:
-    robot = Robot(depth="")
+    robot = MessageStream(depth="")
     for row, stamp in enumerate(stamps):
         robot.colour(stamp, row)
 
@@ -257,7 +212,7 @@ def test_images_whose_stamps_give_no_order_are_named(stamps: list[int], named: s
 
 
 def test_an_image_with_the_bytes_of_the_one_before_is_left_out_and_named() -> None:
-    robot = Robot(depth="")
+    robot = MessageStream(depth="")
     for row, shown in enumerate((0, 0, 1)):
         robot.colour(stamp_of(row), shown)
 
@@ -267,33 +222,10 @@ def test_an_image_with_the_bytes_of_the_one_before_is_left_out_and_named() -> No
 
 @pytest.mark.parametrize("unit", [1000.0, 0.001], ids=["millimetres", "kilometres"])
 def test_depth_of_another_unit_is_named_with_its_median(unit: float) -> None:
-    robot = Robot()
+    robot = MessageStream()
     robot.colour(stamp_of(0))
     depth = (SHOWN.depths_mm[0] / 1000 * unit).astype(np.float32)
     robot.send("depth", raw_image(robot.maker, stamp_of(0), depth, "32FC1"))
 
     assert robot.frame() is None
     assert "the median depth of /camera/aligned_depth_to_color/image_raw is " in robot.frames.check.fault
-
-
-def test_most_images_left_out_are_named_and_few_are_not() -> None:
-    robot = Robot(depth="", queue_frames=1)
-    for row in range(5):
-        robot.colour(stamp_of(row), row)
-    assert robot.frames.check.shortage.startswith("4 of 5 images were left out")
-
-    for row in range(5, 11):
-        robot.colour(stamp_of(row), row % 5)
-        robot.taken()
-    assert not robot.frames.check.shortage
-
-
-def test_a_fault_leaves_the_status_five_reports_later() -> None:
-    check = InputCheck()
-    check.refuse("broken", "it is cut off")
-    faults = []
-    for _ in range(6):
-        faults.append(check.fault)
-        check.next_report()
-
-    assert faults == ["it is cut off"] * 5 + [""]

@@ -43,7 +43,7 @@ class Data:
         return "v2"
 
 
-class Robot:
+class CallRecorder:
     """A robot whose calls are kept."""
 
     def __init__(self) -> None:
@@ -54,8 +54,10 @@ class Robot:
         return SimpleNamespace(reply={"verdict": "ok", "T_map_camera": np.eye(4)})
 
 
-def services(mapper: Any, monkeypatch: pytest.MonkeyPatch, **options: str) -> tuple[MapServices, Robot, Data]:
-    robot, data = Robot(), Data()
+def services(
+    mapper: Any, monkeypatch: pytest.MonkeyPatch, **options: str
+) -> tuple[MapServices, CallRecorder, Data]:
+    robot, data = CallRecorder(), Data()
     monkeypatch.setattr(map_services, "data_client", lambda _: data)
     return MapServices(robot, mapper, BridgeOptions.of(options)), robot, data  # type: ignore[arg-type]
 
@@ -141,10 +143,3 @@ def test_a_live_map_is_published_and_asked_for_the_place_by_its_owner(
     assert asked == ["relocalise"]
     assert told == {"map": "hall", "aligned": False, "reason": "no keyframe matched"}
     assert data.updated == []
-
-
-def test_a_map_of_its_own_cannot_be_relocalised_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    maps, _, _ = services(own_mapper(), monkeypatch)
-
-    with pytest.raises(UsageError, match="begins where the robot did"):
-        asyncio.run(maps.relocalise())

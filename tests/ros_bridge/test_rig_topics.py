@@ -17,7 +17,6 @@ from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from client_sdk.rigs.rig_file import write_rig
 from ros_bridge import BridgeOptions, IncomingFrames
 from ros_bridge.incoming import Role
-from ros_bridge.shell import taken
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_se3
 from tests.kit.small_bags import (
@@ -45,7 +44,7 @@ STEREO = {
 KINDS = {"info": CAMERA_INFO, "right_info": CAMERA_INFO, "imu": IMU}
 
 
-class Robot:
+class StereoMessageStream:
     """The messages of a robot with a pair, as bytes of ROS 1 or CDR."""
 
     def __init__(self, *, is_ros1: bool = True, **options: object) -> None:
@@ -96,7 +95,7 @@ def rig_file(folder: Path, *, right: bool = True, imu: bool = True) -> tuple[Pat
 
 @pytest.mark.parametrize("is_ros1", [True, False])
 def test_a_pair_has_the_baseline_of_both_camera_infos(is_ros1: bool) -> None:
-    robot = Robot(is_ros1=is_ros1)
+    robot = StereoMessageStream(is_ros1=is_ros1)
     robot.infos(-FX * BASELINE_M)
 
     frame = robot.pair(1)
@@ -109,7 +108,7 @@ def test_a_pair_has_the_baseline_of_both_camera_infos(is_ros1: bool) -> None:
 
 
 def test_swapped_cameras_are_told_and_give_no_frame() -> None:
-    robot = Robot()
+    robot = StereoMessageStream()
     robot.infos(FX * BASELINE_M)
 
     assert "swapped" in robot.frames.check.fault
@@ -118,7 +117,7 @@ def test_swapped_cameras_are_told_and_give_no_frame() -> None:
 
 def test_a_file_of_a_rig_rectifies_the_pair_and_places_the_imu(tmp_path: Path) -> None:
     path, rig = rig_file(tmp_path)
-    robot = Robot(rig=str(path), imu="/imu")
+    robot = StereoMessageStream(rig=str(path), imu="/imu")
     robot.infos(-FX * 0.05)  # the file is believed, not P
     assert rig.right is not None
     wanted = Rectification(rig.left, rig.right)
@@ -143,7 +142,7 @@ def test_a_file_of_a_rig_rectifies_the_pair_and_places_the_imu(tmp_path: Path) -
 
 def test_a_frame_waits_for_the_sample_after_it_but_not_for_a_silent_imu(tmp_path: Path) -> None:
     path, _ = rig_file(tmp_path)
-    robot = Robot(rig=str(path), imu="/imu")
+    robot = StereoMessageStream(rig=str(path), imu="/imu")
     robot.infos(-FX * BASELINE_M)
     robot.imu(stamp_of(0) - 5_000_000)
     assert robot.pair(0) is None
@@ -162,23 +161,6 @@ def test_a_frame_waits_for_the_sample_after_it_but_not_for_a_silent_imu(tmp_path
     assert robot.frames.take() is not None  # 0.3 s after the last sample: the IMU is silent
 
 
-def test_a_sample_that_is_not_finite_is_counted_and_left_out(tmp_path: Path) -> None:
-    path, _ = rig_file(tmp_path)
-    robot = Robot(rig=str(path), imu="/imu")
-
-    robot.imu(stamp_of(0), rate=float("nan"))
-
-    assert robot.frames.check.left_out["broken"] == 1
-    assert "not finite" in robot.frames.check.fault
-
-
-def test_the_right_topic_takes_the_place_of_depth() -> None:
-    topics = [role for role, _, _ in taken(BridgeOptions.of(STEREO | {"depth": "/depth"}))]
-
-    assert topics == ["info", "right_info", "right", "colour"]
-    assert [role for role, _, _ in taken(BridgeOptions())] == ["info", "depth", "colour"]
-
-
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -190,10 +172,3 @@ def test_the_right_topic_takes_the_place_of_depth() -> None:
 def test_what_is_missing_is_one_line(options: dict[str, str], says: str) -> None:
     with pytest.raises(UsageError, match=says):
         BridgeOptions.of(options)
-
-
-def test_a_file_without_an_imu_that_has_a_topic_is_refused(tmp_path: Path) -> None:
-    path, _ = rig_file(tmp_path, imu=False)
-
-    with pytest.raises(UsageError, match="no IMU"):
-        Robot(rig=str(path), imu="/imu")

@@ -20,7 +20,7 @@ from rse_pf.geometry import Camera, exp_se3
 from rse_pf.live_map.events import KeyframeAdded, RobotForgotten
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
-from rse_pf.maps.descriptors import MAX_DESCRIPTOR_SIZE, ORB, DescriptorKind, common_kind
+from rse_pf.maps.descriptors import ORB, DescriptorKind, common_kind
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
@@ -48,7 +48,6 @@ from rse_pf.slam.tracking import (
     match_predictions,
 )
 from rse_pf.wire import Command, Failure, Result
-from tests.kit.generated_drives import GeneratedWorld, circle
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 SIFT, XFEAT, AKAZE = (
@@ -114,19 +113,6 @@ def test_distances_are_exact_whole_numbers(kind: DescriptorKind) -> None:
     assert oracle.max() <= distance_bound(first)
 
 
-def test_distances_of_the_longest_vectors_do_not_depend_on_the_order_of_their_dimensions() -> None:
-    rng = np.random.default_rng(7)
-    vectors = rng.choice(np.array([-128, -127, 126, 127], dtype=np.int8), (40, MAX_DESCRIPTOR_SIZE))
-    order = rng.permutation(MAX_DESCRIPTOR_SIZE)
-    exact = ((vectors[:, None].astype(np.int64) - vectors[None]) ** 2).sum(axis=2)
-
-    distances = distance_matrix(vectors, vectors)
-
-    assert exact.max() > 2**24
-    assert np.array_equal(distances, exact.astype(np.float32))
-    assert np.array_equal(distances, distance_matrix(vectors[:, order], vectors[:, order]))
-
-
 @pytest.mark.parametrize("kind", KINDS, ids=str)
 def test_matches_are_the_nearest_by_the_ratio_and_one_to_one(kind: DescriptorKind) -> None:
     view = random_descriptors(kind, 60, 3)
@@ -138,16 +124,6 @@ def test_matches_are_the_nearest_by_the_ratio_and_one_to_one(kind: DescriptorKin
     assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 7), (1, 20), (3, 41)]
     rows, columns = best_matches(reference, ambiguous, 0.8)
     assert 3 not in rows.tolist()
-
-
-def test_many_vectors_are_matched_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    view, reference = random_descriptors(XFEAT, 90, 3), random_descriptors(XFEAT, 50, 4)
-    whole = best_matches(reference, view, 0.95)
-
-    monkeypatch.setattr("rse_pf.slam.descriptors._BLOCK_DISTANCES", 200)
-
-    assert len(whole[0])
-    assert all(map(np.array_equal, best_matches(reference, view, 0.95), whole))
 
 
 def test_descriptors_of_two_kinds_are_not_compared() -> None:
@@ -464,10 +440,3 @@ def test_a_version_of_a_live_map_keeps_its_kind_and_starts_another_one() -> None
     assert version.kind == again.kind == SIFT
     with pytest.raises(BadRequest, match="features of kind sift"):
         again.check_keyframe(added("b", 0, ORB))
-
-
-def test_a_live_map_of_orb_is_as_before() -> None:
-    world, live = GeneratedWorld(seed=1), LiveMap()
-    for event in world.play([world.drive("a", circle(0.5, 1.2))]):
-        live.apply(event)
-    assert live.kind == ORB

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rse_pf.slam.descriptors import best_matches, match_all, match_orb
+from rse_pf.slam.descriptors import match_all, match_orb
 from tests.oracles import matching
 
 LANES = pytest.mark.parametrize("lanes", ["portable", "avx2", "avx512"])
@@ -41,28 +41,6 @@ def test_matches_are_those_of_the_definition_among_many_ties(lanes: Any) -> None
         counts.append(len(rows))
     assert min(counts) == 0
     assert max(counts) > 100
-
-
-@LANES
-@pytest.mark.parametrize(
-    ("fills", "nearest"), [((0, 255), [0]), ((255, 0), [1]), ((255, 255), []), ((0, 0), [])]
-)
-def test_all_bits_and_no_bit_may_differ(lanes: Any, fills: tuple[int, int], nearest: list[int]) -> None:
-    view = np.repeat(np.uint8(fills)[:, None], 32, axis=1)
-
-    _, columns = match_orb(np.zeros((1, 32), np.uint8), view, 1.0, lanes=lanes)
-
-    assert columns.tolist() == nearest  # two at one distance are no clear match
-
-
-def test_arrays_need_not_be_contiguous() -> None:
-    rng = np.random.default_rng(0)
-    first, second = (descriptors(rng, n, distinct=200, noise=2) for n in (80, 90))
-
-    found = best_matches(np.repeat(first, 2, axis=0)[::2], np.asfortranarray(second), 0.8)
-
-    assert len(found[0]) > 10
-    np.testing.assert_array_equal(found, best_matches(first, second, 0.8))
 
 
 def test_matches_beyond_the_largest_distance_are_left_out() -> None:

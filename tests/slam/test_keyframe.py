@@ -96,16 +96,6 @@ def test_rows_without_a_usable_depth_or_pixel_are_left_out() -> None:
     assert np.array_equal(make_features(pixels, depths_m, descriptors).descriptors, descriptors[8:])
 
 
-def test_the_first_features_are_kept_where_there_are_too_many() -> None:
-    pixels, depths_m, descriptors = random_features(2000)
-    depths_m[:10] = 0.0
-
-    found = make_features(pixels, depths_m, descriptors)
-
-    assert np.array_equal(found.descriptors, descriptors[10 : 10 + MAX_FEATURES])
-    assert len(encode_keyframe(replace(keyframe(), features=found))) < MAX_KEYFRAME_BYTES
-
-
 @pytest.mark.parametrize(("width", "step_px"), [(4000, 1 / 16), (8000, 1 / 8), (16_000, 1 / 4)])
 def test_wide_images_have_coarser_pixels(width: int, step_px: float) -> None:
     pixels, depths_m, descriptors = random_features(200, width=width, height=3000)
@@ -116,21 +106,6 @@ def test_wide_images_have_coarser_pixels(width: int, step_px: float) -> None:
 
     assert_equal(found, made)
     assert step_px / 4 < np.abs(found.features.pixels - pixels).max() <= step_px / 2 + 1e-3
-
-
-def test_points_lie_on_the_rays_of_the_pixels() -> None:
-    features = keyframe(50).features
-
-    points = features.points_camera(CAMERA)
-
-    np.testing.assert_allclose(CAMERA.project(points), features.pixels, atol=1e-4)
-    np.testing.assert_allclose(points[:, 2], features.depths_m)
-
-
-def test_shapes_that_do_not_fit_are_refused() -> None:
-    pixels, depths_m, descriptors = random_features(5)
-    with pytest.raises(BadRequest, match="do not fit"):
-        make_features(pixels[:4], depths_m, descriptors)
 
 
 def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
@@ -340,17 +315,6 @@ def test_malformed_keyframes_are_refused_with_a_hint(data: bytes, why: str) -> N
         decode_keyframe(data)
     assert refused.value.hint
     assert "\n" not in refused.value.message
-
-
-def test_intrinsics_that_are_no_camera_are_refused() -> None:
-    for at, form, value in ((2, "<H", 0), (6, "<d", math.nan), (6, "<d", -1.0), (22, "<d", 1e9)):
-        with pytest.raises(InvalidCamera):
-            decode_keyframe(changed(CAMERA_AT + at, form, value))
-
-
-def test_a_keyframe_without_one_of_its_blocks_is_refused() -> None:
-    with pytest.raises(BadRequest, match="no block of the camera"):
-        decode_keyframe(changed(3, "<B", 0)[:HEAD])
 
 
 @pytest.mark.parametrize("whole", [GOOD, STEREO, SCALELESS], ids=["depth", "stereo", "one lens"])

@@ -69,12 +69,6 @@ def test_two_maps_that_share_views_become_one() -> None:
     assert [row[0] for row in merged.version.provenance["from"]] == [0] * 13 + [1] * 13
 
 
-def test_the_same_maps_give_the_same_map() -> None:
-    maps, _ = two_robots()
-
-    assert encode_map(merge_versions(maps).version) == encode_map(merged_without_wrong_links().version)
-
-
 def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_reported() -> None:
     here, _ = WORLD.walk("a", np.linspace(0.0, 0.3, 8), seed=1)
     elsewhere, _ = make_world(2).walk("b", np.linspace(0.0, 0.3, 8), seed=2)
@@ -201,17 +195,6 @@ def test_a_merge_can_be_cancelled_half_way() -> None:
     with pytest.raises(Cancelled):
         merge_versions(maps, report=stop)
     assert heard == sorted(heard)
-
-
-def test_the_largest_set_that_agrees_is_found() -> None:
-    agree = np.zeros((7, 7), dtype=bool)
-    for group in ((0, 1, 2), (2, 3, 4, 5), (5, 6)):
-        for one in group:
-            for other in group:
-                agree[one, other] = one != other
-
-    assert find_maximum_clique(agree).tolist() == [2, 3, 4, 5]
-    assert find_maximum_clique(np.zeros((0, 0), dtype=bool)).tolist() == []
 
 
 @pytest.mark.parametrize("seed", range(3))

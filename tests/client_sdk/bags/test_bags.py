@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,13 +13,11 @@ import pytest
 from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.bag import Bag
 from client_sdk.bags.bag_file import BrokenMessage
-from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth
-from client_sdk.bags.index import pair_stamps
-from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE, TF, load_types
+from client_sdk.bags.images import ImageFormat, check_image, decode_colour
+from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, POSE, TF, load_types
 from client_sdk.bags.poses import PoseTopic
-from client_sdk.bags.registration import register_depth
 from client_sdk.datasets import open_dataset
-from rse_pf.geometry import Camera, rotation_angle_deg
+from rse_pf.geometry import Camera
 from tests.kit.recorded_bags import write_recording
 from tests.kit.small_bags import (
     COLOUR,
@@ -70,13 +67,6 @@ def test_every_kind_of_bag_gives_the_same_frames(
         assert bag.camera == Camera(fx=FX, fy=FX, cx=CX, cy=CY, width=WIDTH, height=HEIGHT)
 
 
-def test_frames_can_be_read_in_any_order_and_again(tmp_path: Path) -> None:
-    with open_bag(write_bag(tmp_path)) as bag:
-        rows = [bag.read(row).rgb for row in (3, 0, 4, 4, 1)]
-
-    np.testing.assert_array_equal(rows, scene().colours[[3, 0, 4, 4, 1]])
-
-
 @pytest.mark.parametrize("kind", FIRST_KINDS)
 def test_time_stamps_that_are_not_in_order_are_sorted_and_told(tmp_path: Path, kind: BagKind) -> None:
     def shuffled(_: BagWriter, messages: list[Message]) -> list[Message]:
@@ -120,13 +110,6 @@ def test_colour_and_depth_are_paired_within_the_bound(tmp_path: Path) -> None:
         assert_is_the_scene(bag)
 
 
-def test_each_depth_image_belongs_to_one_colour_image_only() -> None:
-    first = np.array([0, 10, 20, 100])
-    second = np.array([11, 19, 300])
-
-    assert pair_stamps(first, second, 15) == [(1, 0), (2, 1)]
-
-
 def test_the_true_path_comes_from_tf_and_is_interpolated(tmp_path: Path) -> None:
     def moved(w: BagWriter, messages: list[Message]) -> list[Message]:
         kept = [each for each in messages if each[1] != TF]
@@ -143,24 +126,6 @@ def test_the_true_path_comes_from_tf_and_is_interpolated(tmp_path: Path) -> None
         np.testing.assert_allclose(
             bag.truth.positions, [[0.1 * row, 0, 1] for row in range(FRAMES)], atol=1e-9
         )
-
-
-def test_rotations_are_interpolated_on_the_shorter_arc() -> None:
-    """A quaternion and its negative are one rotation; the pose between 0 and 90 degrees is at 45."""
-    types = load_types(is_ros1=False).types
-    poses = PoseTopic()
-    for stamp, q in ((0, (0.0, 0.0, 0.0, 1.0)), (100_000_000, (0.0, 0.0, -(0.5**0.5), -(0.5**0.5)))):
-        turn = types["geometry_msgs/msg/Quaternion"](*q)
-        place = types["geometry_msgs/msg/Point"](stamp / 1e8, 0.0, 0.0)
-        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, stamp), "world")
-        poses.add(types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn)))
-
-    path = poses.path([0, 50_000_000, 100_000_000, 150_000_000])
-
-    assert path is not None
-    assert path.timestamps_s.tolist() == [0.0, 0.05, 0.1]  # nothing is known after the last pose
-    assert path.positions[:, 0].tolist() == [0.0, 0.5, 1.0]
-    assert [rotation_angle_deg(T[:3, :3]) for T in path.T_world_camera] == pytest.approx([0, 45, 90])
 
 
 def test_a_jpeg_without_its_end_is_broken() -> None:
@@ -246,17 +211,6 @@ def test_colour_and_depth_of_a_distorted_lens_are_undistorted(
     assert np.abs(seen - wanted.reshape(-1, 2)).max() > 1.5  # so that it could have failed
 
 
-def test_rectified_images_are_not_undistorted_again(tmp_path: Path) -> None:
-    def rectified(w: BagWriter, messages: list[Message]) -> list[Message]:
-        info = camera_info(w, stamp_of(0), (-0.3, 0.1, 0, 0, 0))
-        kept = [each for each in messages if each[1] != CAMERA_INFO]
-        kept = [(each[0].replace("image_raw", "image_rect_color"), *each[1:]) for each in kept]
-        return [("/camera/color/camera_info", CAMERA_INFO, stamp_of(0), info), *kept]
-
-    with open_bag(write_bag(tmp_path, change=rectified)) as bag:
-        assert_is_the_scene(bag)
-
-
 def test_a_depth_camera_beside_the_colours_is_registered_by_tf_static(tmp_path: Path) -> None:
     """The depth camera stands 0.1 m to the left and sees a wall at 1 m: all moves by 6 pixels."""
     depth = np.full((HEIGHT, WIDTH), 1000, np.uint16)
@@ -283,24 +237,6 @@ def test_a_depth_camera_beside_the_colours_is_registered_by_tf_static(tmp_path: 
     expected[20:24, 18:22] = 0.5
     expected[20:24, 24:28] = 0.0  # what stood behind it was not seen
     np.testing.assert_array_equal(found, expected)
-
-
-def test_a_coarse_depth_camera_fills_the_pixels_of_a_finer_colour_camera() -> None:
-    coarse = Camera(fx=30, fy=30, cx=15.5, cy=11.5, width=32, height=24)
-    fine = Camera(fx=60, fy=60, cx=31.5, cy=23.5, width=64, height=48)
-
-    found = register_depth(np.full((24, 32), 2.0, np.float32), coarse, np.eye(4), fine)
-
-    assert (found[1:-1, 1:-1] == 2.0).all()
-
-
-def test_without_depth_the_colours_are_read_alone(tmp_path: Path) -> None:
-    def colours(_: BagWriter, messages: list[Message]) -> list[Message]:
-        return [each for each in messages if each[0] != DEPTH]
-
-    with open_bag(write_bag(tmp_path, change=colours), BagOptions(use_depth=False)) as bag:
-        assert not bag.has_depth
-        assert not any(frame.depth_m.any() for frame in bag)
 
 
 def test_open_dataset_takes_bags_and_shares_them(tmp_path: Path) -> None:
@@ -336,34 +272,6 @@ def test_bayer_patterns_are_turned_into_colours(encoding: str, tile: list[list[i
     image = message_of(np.tile(np.array(tile, np.uint8), (5, 5)), encoding)
 
     assert decode_colour(image)[5, 5].tolist() == [200, 100, 50]
-
-
-def test_yuv_of_two_orders_is_the_same_grey() -> None:
-    uyvy = message_of(np.tile(np.array([[128, 90]], np.uint8), (4, 6)).reshape(4, 6, 2), "yuv422")
-    yuyv = message_of(np.tile(np.array([[90, 128]], np.uint8), (4, 6)).reshape(4, 6, 2), "yuv422_yuy2")
-
-    assert np.array_equal(decode_colour(uyvy), decode_colour(yuyv))
-    assert len(set(decode_colour(uyvy)[0, 0].tolist())) == 1
-
-
-def test_depth_as_floats_is_metres_and_what_is_no_number_is_no_reading() -> None:
-    metres = np.array([[1.5, np.nan, np.inf], [0.0, -1.0, 2.25]], np.float32)
-
-    for order in ("<f4", ">f4"):
-        found = decode_depth(message_of(metres.astype(order), "32FC1"), 1000.0)
-        assert found.tolist() == [[1.5, 0, 0], [0, 0, 2.25]]
-
-
-def test_compressed_depth_of_floats_is_the_inverse_of_its_values() -> None:
-    """By compressed_depth_image_transport: value = a / depth + b, with 0 for no reading."""
-    metres = np.array([[0.5, 1.0, 2.0], [4.0, 8.0, 0.0]])
-    a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0
-    values = np.where(metres > 0, a / np.maximum(metres, 1e-9) + b, 0).astype(np.uint16)
-    data = struct.pack("<iff", 1, a, b) + cv2.imencode(".png", values)[1].tobytes()
-    types = load_types(is_ros1=False).types
-    message = types[COMPRESSED_IMAGE](None, "32FC1; compressedDepth png", np.frombuffer(data, np.uint8))
-
-    np.testing.assert_allclose(decode_depth(message, 1000.0), metres, rtol=0.01)
 
 
 def message_of(pixels: np.ndarray[Any, Any], encoding: str) -> Any:

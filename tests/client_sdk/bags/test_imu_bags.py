@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
-from client_sdk.bags import imu as bag_imu
 from client_sdk.bags.message_types import IMU, TF
 from client_sdk.datasets import open_dataset
 from client_sdk.rigs.intrinsics import Intrinsics
@@ -132,16 +131,6 @@ def test_a_rig_of_the_user_tells_place_noise_and_delay(tmp_path: Path) -> None:
     assert track.timestamps_s[0] == pytest.approx((stamp_of(0) - STEP_NS) / 1e9 - 0.05)
 
 
-def test_recordings_take_the_imu_or_leave_it_out(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, make=drive)
-
-    assert open_dataset(path).sensors == "colour + depth + IMU"
-    assert open_dataset(path, imu=False).sensors == "colour + depth"
-    thinned = list(open_dataset(path, imu=True).thinned(5.0))
-    assert thinned[1].imu is not None
-    assert len(thinned[1].imu) == 21
-
-
 def test_samples_in_any_order_copies_and_broken_ones(tmp_path: Path) -> None:
     def shuffled(w: BagWriter, messages: list[Message]) -> list[Message]:
         rows = [row for row, each in enumerate(messages) if each[1] == IMU]
@@ -159,14 +148,6 @@ def test_samples_in_any_order_copies_and_broken_ones(tmp_path: Path) -> None:
         assert len(bag.imu.timestamps_s) == SAMPLES
         np.testing.assert_array_equal(bag.imu.gyro[7], samples_of(7)[0])
         assert bag.log.doubts[0].sentence.startswith("3 broken messages left out; the first: /imu/data: ")
-
-
-def test_the_readings_that_are_kept_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bag_imu, "_MAX_SAMPLES", 30)
-    with open_bag(write_bag(tmp_path, make=drive)) as bag:
-        assert bag.imu is not None
-        assert len(bag.imu.timestamps_s) == 30
-        assert any(f"{SAMPLES - 30} more left out" in note for note in bag.notes)
 
 
 def unplaced(w: BagWriter) -> list[Message]:
@@ -220,15 +201,6 @@ def test_an_imu_that_cannot_be_used_is_told_and_refused_if_it_is_named(
         open_bag(path, BagOptions(imu=IMU_TOPIC))
     with pytest.raises(UsageError, match=says):
         open_dataset(path, imu=True)
-
-
-def test_too_many_samples_between_two_frames_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bag_imu, "MAX_SAMPLES", 10)
-    with open_bag(write_bag(tmp_path, make=drive)) as bag:
-        assert bag.imu is None
-        assert "the IMU is not used: /imu/data has 10 samples between two frames" in bag.notes
 
 
 def test_topics_of_half_an_imu_are_not_taken_by_themselves(tmp_path: Path) -> None:

@@ -171,22 +171,6 @@ def test_frames_keep_their_order_where_the_clock_is_set_back(tmp_path: Path, ste
         assert any(f"set back by {step_ns / 1e9:.3f} s" in note for note in bag.notes)
 
 
-def test_one_topic_without_time_stamps_is_paired_by_the_times_of_recording(tmp_path: Path) -> None:
-    def unstamped(w: BagWriter, stamp: int, row: int) -> tuple[str, str, Any]:
-        return COLOUR, IMAGE, raw_image(w, 0, scene().colours[row], "rgb8")
-
-    with open_bag(write_bag(tmp_path, make=frames(colour=unstamped))) as bag:
-        assert len(list(bag)) == FRAMES
-        assert any("times of recording are used" in note for note in bag.notes)
-
-
-def test_an_image_without_a_time_stamp_among_others_is_left_out(tmp_path: Path) -> None:
-    with open_bag(write_bag(tmp_path, make=frames(stamp=lambda row: stamp_of(row) if row else 0))) as bag:
-        assert len(bag) == FRAMES - 1
-        (doubt,) = bag.log.doubts
-        assert (doubt.name.value, doubt.sentence) == ("left-out", "2 images with the time stamp 0 left out")
-
-
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
@@ -211,13 +195,6 @@ def test_a_unit_of_depth_that_is_assumed_is_a_note(
 ) -> None:
     with open_bag(write_bag(tmp_path, make=frames()), options) as bag:
         assert any("1000 units a metre are assumed" in note for note in bag.notes) is is_assumed
-
-
-def test_the_unit_of_floats_can_be_given(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, make=frames(depth=float_mm))
-
-    with open_bag(path, BagOptions(depth_scale=1000.0)) as bag:
-        np.testing.assert_allclose(bag.read(0).depth_m, scene().depths_mm[0] / 1000.0, rtol=1e-6)
 
 
 def test_a_binned_region_of_a_sensor_has_the_camera_of_its_images(tmp_path: Path) -> None:
@@ -277,12 +254,3 @@ def test_a_recorder_of_realsense_states_unit_cameras_and_mounts(tmp_path: Path) 
         assert middle == pytest.approx(
             [CY + FX * (22 - CY) / (0.75 * FX), CX + FX * ((22 - CX) / (0.75 * FX) - 0.15)], abs=1.0
         )
-
-
-def test_depth_of_another_lens_without_a_mount_is_a_doubt(tmp_path: Path) -> None:
-    def without_mount(w: BagWriter) -> list[Message]:
-        return [each for each in recorded_by_realsense(w) if each[1] != TRANSFORM]
-
-    with open_bag(write_bag(tmp_path, make=without_mount)) as bag:
-        assert [doubt.name.value for doubt in bag.log.doubts] == ["depth-registration"]
-        assert "fx 45) is taken as seen from where" in bag.log.doubts[0].sentence

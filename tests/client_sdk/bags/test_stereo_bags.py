@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from client_sdk.bags import BagKind, BagOptions, BagWriter, Lens, open_bag
-from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TF
+from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, TF
 from client_sdk.datasets import open_dataset
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rectification import Rectification
@@ -30,7 +30,6 @@ from tests.kit.small_bags import (
     WIDTH,
     Message,
     camera_info,
-    compressed,
     raw_frames,
     raw_image,
     scene,
@@ -90,27 +89,6 @@ def test_a_pair_is_found_by_its_names_and_gives_rectified_frames(tmp_path: Path,
         # What the left image shows at u lies at u - disparity in the right one.
         np.testing.assert_array_equal(frame.stereo.gray[:, :-DISPARITY_PX], seen[:, DISPARITY_PX:])
         assert not frame.depth_m.any()
-
-
-def test_compressed_images_in_colour_make_a_pair(tmp_path: Path) -> None:
-    def packed(w: BagWriter, messages: list[Message]) -> list[Message]:
-        changed: list[Message] = []
-        for topic, kind, stamp, message in messages:
-            if kind == IMAGE:
-                pixels = np.repeat(message.data.reshape(HEIGHT, WIDTH, 1), 3, axis=2)
-                data = cv2.imencode(".png", pixels)[1].tobytes()
-                frame = message.header.frame_id
-                image = compressed(w, stamp, data, "bgr8; png compressed bgr8", frame)
-                changed.append((f"{topic}/compressed", COMPRESSED_IMAGE, stamp, image))
-            else:
-                changed.append((topic, kind, stamp, message))
-        return changed
-
-    with open_bag(write_bag(tmp_path, make=pair_messages, change=packed)) as bag:
-        frame = bag.read(2)
-
-    assert frame.stereo is not None
-    np.testing.assert_array_equal(frame.stereo.gray, np.roll(grey()[2], -DISPARITY_PX, axis=1))
 
 
 def true_rig(model: str) -> tuple[RigCamera, RigCamera]:
@@ -224,16 +202,6 @@ def test_depth_is_taken_before_a_pair_unless_the_pair_is_wanted(tmp_path: Path) 
         open_bag(path, BagOptions(right=RIGHT, depth=DEPTH))
 
 
-def test_of_a_pair_the_left_camera_can_be_taken_alone(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, make=pair_messages)
-
-    for dataset in (open_dataset(path, camera="left"), open_dataset(path)):
-        frame = next(iter(dataset))
-        assert (frame.stereo is not None) == dataset.has_stereo
-        np.testing.assert_array_equal(frame.rgb[..., 0], grey()[0])
-    assert (open_dataset(path, camera="left").has_stereo, dataset.has_stereo) == (False, True)
-
-
 @pytest.mark.parametrize(
     "names",
     [("/cam0/image_raw", "/cam1/image_raw"), ("/d/infra1/image_rect_raw", "/d/infra2/image_rect_raw"),
@@ -322,17 +290,6 @@ def test_a_right_camera_without_camera_info_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no camera_info for /rig/right/image_rect") as raised:
         open_bag(path)
     assert "rig.json" in raised.value.hint
-
-
-def test_stamps_that_never_meet_are_told(tmp_path: Path) -> None:
-    def late(w: BagWriter, messages: list[Message]) -> list[Message]:
-        for topic, _, stamp, message in messages:
-            if topic == RIGHT:
-                object.__setattr__(message, "header", w.header(stamp + 50_000_000, "right_eye"))
-        return messages
-
-    with pytest.raises(UsageError, match=r"has a right one within 0.02 s; the nearest is 0.050 s away"):
-        open_bag(write_bag(tmp_path, make=pair_messages, change=late))
 
 
 @pytest.mark.parametrize("kind", FIRST_KINDS)

@@ -24,7 +24,6 @@ from tests.kit.small_bags import (
     WIDTH,
     Message,
     camera_info,
-    compressed,
     compressed_frames,
     raw_image,
     stamp_of,
@@ -56,13 +55,6 @@ def test_a_bag_without_depth_names_the_topics_that_it_has(tmp_path: Path) -> Non
     assert "--no-depth" in raised.value.hint
 
 
-def test_a_bag_without_colours_names_the_topics_that_it_has(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, change=without(COLOUR))
-
-    with pytest.raises(UsageError, match=r"no colour; its topics: .*\(Image 16UC1\)"):
-        open_bag(path)
-
-
 def test_a_bag_without_camera_info_asks_for_intrinsics(tmp_path: Path) -> None:
     path = write_bag(tmp_path, change=without("/camera/color/camera_info"))
 
@@ -82,17 +74,6 @@ def test_an_encoding_that_is_unknown_is_named(tmp_path: Path, encoding: str) -> 
         open_bag(path)
     with pytest.raises(UsageError, match="which is not colour that can be read"):
         open_bag(path, BagOptions(colour=COLOUR))
-
-
-def test_compressed_depth_that_is_not_png_is_refused_in_one_line(tmp_path: Path) -> None:
-    def rvl(w: BagWriter, stamp: int) -> object:
-        return compressed(w, stamp, b"\0" * 40, "16UC1; compressedDepth rvl")
-
-    path = write_bag(tmp_path, change=replaced(DEPTH, rvl, COMPRESSED_IMAGE))
-
-    with pytest.raises(UsageError, match=r"no depth; its topics: .*compressedDepth rvl") as raised:
-        open_bag(path)
-    assert "compressedDepth as PNG" in raised.value.hint
 
 
 @pytest.mark.parametrize("kind", FIRST_KINDS)
@@ -122,17 +103,6 @@ def test_compressed_images_that_are_cut_off_or_damaged_are_left_out(tmp_path: Pa
     with open_bag(write_bag(tmp_path, make=compressed_frames, change=damaged)) as bag:
         assert len(list(bag)) == FRAMES - 2
         assert bag.log.doubts[0].sentence.startswith("2 broken messages left out")
-
-
-def test_an_image_of_another_size_is_left_out(tmp_path: Path) -> None:
-    def resized(w: BagWriter, messages: list[Message]) -> list[Message]:
-        rows = [row for row, each in enumerate(messages) if each[0] == DEPTH]
-        small = raw_image(w, stamp_of(2), np.zeros((4, 4), np.uint16), "16UC1")
-        messages[rows[2]] = (DEPTH, IMAGE, stamp_of(2), small)
-        return messages
-
-    with open_bag(write_bag(tmp_path, change=resized)) as bag:
-        assert len(bag) == FRAMES - 1
 
 
 def test_clocks_that_differ_are_told_with_the_smallest_difference(tmp_path: Path) -> None:
@@ -252,18 +222,6 @@ def attack(path: Path, seeds: range) -> None:
         with contextlib.suppress(RsePfError), open_bag(path) as bag:
             for _ in bag:
                 pass
-
-
-def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "text.bag").write_text("hello\n")
-    (tmp_path / "empty").mkdir()
-    for name, says in (
-        ("text.bag", "cannot be read"),
-        ("empty", "is not a ROS bag"),
-        ("none.mcap", "no bag"),
-    ):
-        with pytest.raises(UsageError, match=says):
-            open_bag(tmp_path / name)
 
 
 def test_the_verb_says_in_two_lines_what_is_missing(

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from client_sdk.cameras import FrameSource, Intrinsics, open_camera, read_intrinsics, write_intrinsics
+from client_sdk.cameras import FrameSource, Intrinsics, open_camera, write_intrinsics
 from client_sdk.cameras.opencv_video import open_video
 from rse_pf.errors import MissingExtra, RsePfError, UsageError
 from rse_pf.geometry import Camera
@@ -160,12 +160,6 @@ def test_a_rate_leaves_frames_out(tmp_path: Path) -> None:
         assert [frame.timestamp_s for frame in source] == pytest.approx([0.0, 0.2, 0.4])
 
 
-def test_depth_can_be_left_out(tmp_path: Path) -> None:
-    with open_camera(recording(tmp_path), depth=False) as source:
-        assert not next(source).depth_m.any()
-        assert not source.has_depth
-
-
 def test_a_device_that_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "VideoCapture", FakeDevice)
     ticks = itertools.count()
@@ -203,16 +197,6 @@ def test_a_distorted_lens_is_straightened(tmp_path: Path) -> None:
     *_, plain = open_camera(path, intrinsics=INTRINSICS)
 
     assert not np.array_equal(straight.rgb, plain.rgb)
-
-
-def test_intrinsics_are_read_as_they_were_written(tmp_path: Path) -> None:
-    made = Intrinsics(
-        camera=CAMERA, distortion=(0.1, 0.0, 0.0, 0.0, 0.2), depth_scale=5000.0, rms_px=0.25, views=20
-    )
-
-    write_intrinsics(tmp_path / "i.json", made)
-
-    assert read_intrinsics(tmp_path / "i.json") == made
 
 
 def _of_another_size(folder: Path) -> None:

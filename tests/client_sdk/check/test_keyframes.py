@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from client_sdk.check.keyframes import KeyframeStore, depths_at, matched
+from client_sdk.check.keyframes import KeyframeStore, depths_at
 from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.simulator import render_frames
 from client_sdk.tracking.monocular_tracker import MonocularTracker
@@ -18,17 +18,6 @@ from rse_pf.maps.descriptors import DescriptorKind
 @cache
 def frames() -> tuple[Frame, ...]:
     return tuple(render_frames(0, 1, 9, 3))
-
-
-def test_a_frame_that_shows_the_same_is_not_kept() -> None:
-    seen, store = frames(), KeyframeStore()
-
-    for row in range(5):
-        store.add(replace(seen[0], timestamp_s=float(row)), None)
-    store.add(replace(seen[8], timestamp_s=9.0), None)
-
-    assert store.frames == 6
-    assert [keyframe.row for keyframe in store.keyframes] == [0, 5]
 
 
 def test_depths_around_a_keyframe_are_those_of_other_frames_at_its_pixels() -> None:
@@ -42,18 +31,6 @@ def test_depths_around_a_keyframe_are_those_of_other_frames_at_its_pixels() -> N
     assert offsets == [-0.4, -0.2, 0.0, 0.2, 0.4]
     later = {round(offset, 3): depths for offset, depths in middle.around}[0.2]
     np.testing.assert_array_equal(later, depths_at(seen[middle.row + 1].depth_m, middle.pixels))
-
-
-def test_matches_need_no_calibration() -> None:
-    seen, store = frames()[::8], KeyframeStore()
-    for frame in seen:
-        store.add(frame, None)
-
-    one, other = matched(*store.keyframes)
-
-    moved = np.linalg.norm(store.keyframes[0].pixels[one] - store.keyframes[1].pixels[other], axis=1)
-    assert len(one) > 100
-    assert np.median(moved) < 60.0
 
 
 def found_by(frame: Frame, tracker: Tracker | MonocularTracker) -> Features:

@@ -9,10 +9,8 @@ from client_sdk.check.findings import FaultKind, Finding
 from client_sdk.check.motion import (
     CameraMotion,
     MotionReference,
-    _explains,
     check_imu,
     check_motion,
-    nothing_to_compare,
 )
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
@@ -125,27 +123,6 @@ def test_a_drive_at_one_speed_without_turns_tells_no_delay() -> None:
     assert {FaultKind.STAMP_DELAY, FaultKind.MIRRORED} <= {each.kind for each in untold}
 
 
-def test_paths_that_have_nothing_in_common_are_not_compared() -> None:
-    known_s = np.arange(0.0, 23.0, 0.05)
-    other = InertialDrive(MODEL, Motion(), seed=99).T_world_camera(known_s)
-
-    findings, untold = check_motion(
-        CameraMotion(stamps_s=stamps(), T_world_camera=tracked(stamps())),
-        MotionReference(path=Trajectory(known_s, other)),
-    )
-
-    assert findings == []
-    assert untold
-
-
-def test_without_a_reference_it_is_said_what_cannot_be_told() -> None:
-    kinds = {each.kind for each in nothing_to_compare(has_depth=True)}
-
-    assert kinds == {
-        FaultKind.STAMP_DELAY, FaultKind.MIRRORED, FaultKind.SWAPPED_AXES, FaultKind.DEPTH_SCALE,
-    }  # fmt: skip
-
-
 def imu_history(shift_s: float = 0.0) -> ImuHistory:
     imu, history = SimulatedImu(drive(), 22.0, seed=3), ImuHistory(MODEL)
     history.add(imu.between(0.0, 22.0 + shift_s))
@@ -178,17 +155,3 @@ def test_what_a_pair_cannot_tell_of_its_metres_is_its_baseline() -> None:
 
     assert FaultKind.BASELINE in {each.kind for each in untold}
     assert FaultKind.DEPTH_SCALE not in {each.kind for each in untold}
-
-
-@pytest.mark.parametrize(
-    ("in_parts", "share_left", "is_told"),
-    [(10, 0.8, True), (2, 0.8, False), (10, 0.4, True), (9, 0.3, True)],
-)
-def test_a_delay_that_explains_little_does_so_in_most_parts_of_the_drive(
-    in_parts: int, share_left: float, is_told: bool
-) -> None:
-    without = np.ones(200)
-    with_delay = without.copy()
-    with_delay[: 20 * in_parts] = share_left
-
-    assert _explains(with_delay, without) is is_told

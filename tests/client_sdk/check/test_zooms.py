@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -67,25 +65,3 @@ def test_a_focal_length_that_errors_of_depth_move_is_no_finding_and_this_is_said
 
     assert judged.finding is None
     assert said in judged.cannot_tell[0].reason
-
-
-def test_the_cost_is_the_distance_of_the_paths_after_alignment() -> None:
-    common, bent = adjusted(np.zeros(VIEWS), 0.01), adjusted(HALVES, 0.001)
-    bent.T_camera_world[:, 1, 3] += np.where(np.arange(VIEWS) // 5 % 2 == 0, 0.02, -0.02) + 0.3
-
-    found = judge_zooms(bent, np.arange(VIEWS) / 2.0, common).finding
-
-    assert found is not None
-    assert found.cost_m == pytest.approx(0.018, rel=0.02)  # the rest is a turn
-
-
-def test_a_drive_without_depth_does_not_blame_depth() -> None:
-    common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
-    reasons = [
-        judge_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metric_scale=has))
-        .cannot_tell[0]
-        .reason
-        for has in (True, False)
-    ]
-
-    assert ["of depth" in reason for reason in reasons] == [True, False]

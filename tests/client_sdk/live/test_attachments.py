@@ -13,7 +13,7 @@ from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.attachments import encode_keyframe_points
-from rse_pf.errors import ConnectError, Forbidden, UsageError
+from rse_pf.errors import ConnectError, Forbidden
 from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.keyframe_points import decode_points
 from tests.client_sdk.live.test_live_mapper import QUICK, drive
@@ -73,10 +73,6 @@ def test_near_points_are_thinned_to_one_for_each_centimetre() -> None:
     points, _ = decode_points(data, CAMERA)
     width_m, height_m = 0.4 * 320 / 500, 0.4 * 240 / 500
     assert len(points) <= (width_m / 0.01 + 2) * (height_m / 0.01 + 2)
-
-
-def test_a_frame_without_depth_has_no_points() -> None:
-    assert encode_keyframe_points(frame_at(0, depth=False), NO_FEATURES, 2_000) is None
 
 
 async def test_each_keyframe_refers_to_points_that_the_robot_stores(robot: FakeLiveRobot) -> None:
@@ -149,30 +145,6 @@ async def test_a_robot_that_cannot_store_points_still_maps_and_leaves(
     assert len(robot.kept) == 3
     assert mapper.report()["live"]["points"]["sent"] == 0
     assert mapper.report()["live"]["points"]["trouble"]
-
-
-async def test_a_keyframe_has_at_most_the_points_of_the_options(robot: FakeLiveRobot) -> None:
-    objects = Objects()
-    live = replace(QUICK, points=50, points_bytes_per_s=1e9, leave_s=5.0)
-    async with mapper_of(robot, objects, live) as mapper:
-        await drive(mapper, range(5))
-
-    assert objects.held
-    assert all(len(decode_points(data, CAMERA)[0]) <= 50 for data in objects.held.values())
-
-
-async def test_no_points_are_made_where_none_are_wanted(robot: FakeLiveRobot) -> None:
-    objects = Objects()
-    async with mapper_of(robot, objects, replace(QUICK, points=0)) as mapper:
-        await drive(mapper, range(5))
-        await robot.until(lambda: mapper.keyframes_waiting == 0)
-    assert not objects.tries
-    assert all(decode_keyframe(request.keyframe).points is None for request in robot.kept)
-
-
-def test_more_points_than_an_object_holds_are_refused() -> None:
-    with pytest.raises(UsageError, match="points = 20000 is above 16000"):
-        LiveOptions(points=20_000)
 
 
 @pytest.mark.parametrize(("is_allowed", "is_wanted"), [(True, True), (True, False), (False, True)])

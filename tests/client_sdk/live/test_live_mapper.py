@@ -255,25 +255,6 @@ def test_the_spool_of_a_program_that_was_killed_is_free(tmp_path: Path) -> None:
     queue.close()
 
 
-async def test_keyframes_that_were_refused_are_counted_after_the_drive_too(
-    robot: FakeLiveRobot, tmp_path: Path
-) -> None:
-    async with live_map(robot) as mapper:
-        await drive(mapper, range(6))
-        await robot.until(lambda: mapper.keyframes_waiting == 0)
-        mapper._sender.refused_keyframes = 2
-    assert mapper.report()["live"]["keyframes_refused"] == 2
-
-
-async def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers(robot: FakeLiveRobot) -> None:
-    for _ in range(2):
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(6))
-            await robot.until(lambda mapper=mapper: mapper.keyframes_waiting == 0)
-
-    assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1), (3, 1)]
-
-
 async def test_a_map_that_was_started_again_gets_new_numbers_and_ends_old_alignments(
     robot: FakeLiveRobot,
 ) -> None:
@@ -464,12 +445,6 @@ def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
         assert list(corrections) == []  # they end with the live map
     finally:
         loop.close()
-
-
-async def test_a_map_that_is_not_joined_is_refused(robot: FakeLiveRobot) -> None:
-    mapper = live_map(robot)
-    with pytest.raises(UsageError, match="not joined"):
-        await mapper.track(frame_at(0, depth=True))
 
 
 def test_a_small_spool_opens_empty_and_a_damaged_one_is_refused(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from client_sdk.blocking_robot import BlockingMapper
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
@@ -23,8 +22,8 @@ from client_sdk.monocular.scale import OdometryScale
 from client_sdk.point_map import read_ply
 from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
-from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
-from rse_pf.errors import Busy, MissingExtra, UsageError
+from client_sdk.trajectory import Trajectory, read_trajectory
+from rse_pf.errors import Busy, UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
@@ -74,23 +73,6 @@ def test_a_frame_without_an_answer_is_lost_with_the_reason_and_the_next_frame_is
     assert done[1].reason == "busy: the server is busy"
     assert mapper.lost_frames == 1
     assert mapper.report()["lost_because"] == {"busy: the server is busy": 1}
-
-
-def test_a_configuration_error_of_the_solver_is_raised_and_tracking_can_continue() -> None:
-    fails = True
-
-    async def ask(query: PoseQuery) -> PoseAnswer:
-        if fails:
-            raise MissingExtra("the native core", "vision")
-        return await solve(query)
-
-    mapper = Mapper(ask=ask)
-    drive(mapper, range(1), depth=True)
-    with pytest.raises(MissingExtra):
-        drive(mapper, range(1, 2), depth=True)
-    fails = False
-
-    assert drive(mapper, range(2, 3), depth=True)[0].status == "tracked"
 
 
 async def test_a_cancelled_frame_leaves_the_mapper_usable() -> None:
@@ -227,17 +209,6 @@ def test_saves_files_that_other_programs_read(tmp_path: Path) -> None:
         mapper.save(tmp_path / "out" / "map.ply")
 
 
-def test_the_blocking_mapper_gives_the_same_results() -> None:
-    mapper = BlockingMapper(Mapper(ask=solve))
-
-    done = [mapper.track(frame_at(row, depth=True)) for row in range(2)]
-
-    assert [each.status for each in done] == ["first", "tracked"]
-    assert mapper.trajectory.positions[1, 0] == pytest.approx(STEP_M, abs=5e-3)
-    assert len(mapper.map) > 1000
-    assert mapper.scale == "metric, by depth"
-
-
 @pytest.mark.slow
 def test_the_kitchen_without_its_depth_is_mapped_within_8_cm(recordings: Path) -> None:
     dataset = open_dataset(recordings / "7scenes_redkitchen")
@@ -342,15 +313,3 @@ def test_a_rig_gives_the_poses_of_its_body_beside_those_of_its_camera(tmp_path):
         np.testing.assert_allclose(bodies.T_world_camera[row], each.T_world_body, atol=1e-8)
     np.testing.assert_allclose(bodies.timestamps_s, cameras.timestamps_s)
     assert "T_world_body, metres" in (tmp_path / "trajectory-body.txt").read_text()
-
-
-def test_without_metres_or_a_rig_there_is_no_pose_of_a_body(tmp_path):
-    (plain,) = tracked(Mapper(ask=solve), [frame_at(0, depth=True)])
-    rigged = replace(plain, frame=replace(plain.frame, T_body_camera=np.eye(4)))
-
-    assert plain.T_world_body is None
-    assert rigged.T_world_body is not None
-    assert replace(rigged, scale="up to scale").T_world_body is None
-    path = Trajectory(np.zeros(1), np.eye(4)[None])
-    write_trajectory(tmp_path / "trajectory.txt", path, is_metric=False, T_body_camera=np.eye(4))
-    assert [each.name for each in tmp_path.iterdir()] == ["trajectory.txt"]

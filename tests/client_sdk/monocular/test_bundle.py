@@ -10,7 +10,6 @@ from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.monocular.two_view import start_from_two_views
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
-from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.triangulation import reprojection_errors, triangulate
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -100,10 +99,6 @@ def test_a_turn_or_a_tiny_step_is_no_start(twist: list[float], why: str) -> None
     assert why in start_from_two_views(pixels[0], second, CAMERA).reason
 
 
-def test_too_few_matches_are_no_start() -> None:
-    assert "only 5 matches" in start_from_two_views(np.zeros((5, 2)), np.zeros((5, 2)), CAMERA).reason
-
-
 def test_triangulates_and_refuses_what_disagrees() -> None:
     world, poses, pixels = scene()
     second = pixels[4].copy()
@@ -114,16 +109,6 @@ def test_triangulates_and_refuses_what_disagrees() -> None:
     assert not good[0]
     assert good[1:].all()
     np.testing.assert_allclose(points[1:], world[1:], atol=1e-6)
-
-
-def test_matches_are_one_to_one() -> None:
-    rng = np.random.default_rng(6)
-    descriptors = rng.integers(0, 256, (50, 32), dtype=np.uint8)
-    shuffled = rng.permutation(50)
-
-    rows, columns = match_all(descriptors, descriptors[shuffled])
-    np.testing.assert_array_equal(shuffled[columns], rows)
-    assert len(rows) == 50
 
 
 def test_odometry_gives_the_scale_after_its_first_metre() -> None:

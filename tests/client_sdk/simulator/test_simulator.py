@@ -94,19 +94,6 @@ def test_every_ray_ends_on_a_surface_of_the_world(renderer: Renderer):
     assert (points < [3 * ROOM_M + 0.001, DEPTH_M + 0.001, HEIGHT_M + 0.001]).all()
 
 
-def test_the_depth_of_a_wall_is_exact(renderer: Renderer):
-    pose = np.eye(4)
-    pose[:3, :3] = [[0, 0, -1], [1, 0, 0], [0, -1, 0]]  # looking along -x; x of the image is +y
-    pose[:3, 3] = [1.0, 1.5, 0.5]
-
-    _, depth_m, cosine = renderer.draw(pose)
-
-    assert depth_m[240, 320] == pytest.approx(1.0, abs=1e-5)
-    assert cosine[240, 320] == pytest.approx(1.0, abs=1e-4)
-    # the floor, 0.5 m below: row 239.5 + 525 * 0.5 / z, so at row 449 z = 0.5 * 525 / 209.5
-    assert depth_m[449, 320] == pytest.approx(0.5 * 525 / 209.5, abs=1e-4) or depth_m[449, 320] < 1.0001
-
-
 def test_depth_noise_has_the_size_that_the_model_says():
     rng = np.random.default_rng(0)
     for z in (1.0, 2.0, 4.0):
@@ -135,12 +122,6 @@ def test_depth_has_holes_at_edges_at_grazing_angles_and_out_of_range():
     assert not seen[3:59, 50:53].any()  # the shadow of the nearer surface
     assert seen[3:59, :50].mean() > 0.99
     assert seen[3:59, 53:].mean() > 0.99
-
-
-def test_robots_that_do_not_exist_are_refused():
-    for arguments in ((3, 3, 10, 0), (-1, 3, 10, 0), (0, 1, 0, 0)):
-        with pytest.raises(UsageError):
-            next(render_frames(*arguments))
 
 
 @pytest.mark.slow

@@ -5,20 +5,17 @@ from __future__ import annotations
 import base64
 import statistics
 import time
-from pathlib import Path
 
 import pytest
 
 from rse_pf.auth import roster as roster_file
-from rse_pf.auth import trust_store
-from rse_pf.auth.roster import MAX_ROBOTS_OF_TENANT, MAX_ROSTER_BYTES, EnrolledRobot, Roster, key_id_of
+from rse_pf.auth.roster import MAX_ROBOTS_OF_TENANT, MAX_ROSTER_BYTES, EnrolledRobot, Roster
 from rse_pf.auth.tokens import KeySet, SigningKey, verify_token
-from rse_pf.auth.trust_store import AccessControlStore, TrustStore, key_set_from_snapshot
+from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.config import AuthSettings
 from rse_pf.errors import UsageError
-from rse_pf.storage.object_store import DirectoryStore, MemoryStore
+from rse_pf.storage.object_store import MemoryStore
 
-PLATFORM = SigningKey.from_seed(b"p" * 32, "p1")
 HONEST = SigningKey.of_robot(b"h" * 32)
 NOW_S = 1_000_000.0
 SETTINGS = AuthSettings()
@@ -75,44 +72,6 @@ def test_a_name_that_looks_like_another_of_the_tenant_is_not_enrolled(name: str)
     with pytest.raises(UsageError, match="looks like 'robot-1'"):
         known.enrolled(other)
     assert len(known.enrolled(EnrolledRobot(robot=name, tenant="elsewhere", x=x_of(2))).robots) == 2
-
-
-def test_a_roster_that_did_not_change_is_not_parsed_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "keys.json").write_text(PLATFORM.key_set().to_json())
-    access = AccessControlStore(DirectoryStore(tmp_path))
-    access.create_missing()
-    access.change_roster(lambda _: Roster(robots=robots(100)))
-    trust = TrustStore(tmp_path / "keys.json")
-    parsed: list[type] = []
-    monkeypatch.setattr(
-        trust_store, "from_json", lambda data, kind: parsed.append(kind) or roster_file.from_json(data, kind)
-    )
-
-    assert trust.refresh()
-    first = len(parsed)
-    assert not trust.refresh()
-    assert len(parsed) == first
-
-    access.change_roster(lambda _: Roster(robots=robots(101)))
-    assert trust.refresh()
-    assert trust.keys is not None
-    assert trust.keys.knows(key_id_of(x_of(100)))
-
-
-def test_one_enrolment_more_costs_a_worker_no_digest_of_the_others(tmp_path: Path) -> None:
-    (tmp_path / "keys.json").write_text(PLATFORM.key_set().to_json())
-    access = AccessControlStore(DirectoryStore(tmp_path))
-    access.create_missing()
-    access.change_roster(lambda _: Roster(robots=robots(5000)))
-    trust = TrustStore(tmp_path / "keys.json")
-    trust.refresh()
-    before = key_id_of.cache_info().misses
-
-    key_set_from_snapshot(trust.snapshot)
-
-    assert key_id_of.cache_info().misses == before
 
 
 def test_a_handshake_costs_the_same_beside_ten_thousand_robots_of_another_tenant() -> None:

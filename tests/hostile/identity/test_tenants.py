@@ -39,7 +39,7 @@ def server(folder: Path) -> Iterator[GuardedServer]:
         yield server
 
 
-class Robot:
+class EnrolledRobotSocket:
     """An enrolled robot: its key, its entry in the roster, and one socket."""
 
     def __init__(self, server: GuardedServer, seed: bytes) -> None:
@@ -112,7 +112,7 @@ def test_each_robot_finds_its_own_state_again_after_a_restart(server: GuardedSer
 
 def test_narrowed_scopes_reach_an_open_connection_within_two_seconds(server: GuardedServer):
     async def narrowed_after_s() -> float:
-        robot = Robot(server, b"n" * 32)
+        robot = EnrolledRobotSocket(server, b"n" * 32)
         robot.enroll("services:echo", "services:keeper")
         await robot.connect()
         try:
@@ -133,14 +133,14 @@ def test_narrowed_scopes_reach_an_open_connection_within_two_seconds(server: Gua
 
 def test_a_name_that_is_enrolled_again_sees_nothing_of_the_robot_before(server: GuardedServer, folder: Path):
     data = b"an object of the robot before"
-    before, after = Robot(server, b"1" * 32), Robot(server, b"2" * 32)
+    before, after = EnrolledRobotSocket(server, b"1" * 32), EnrolledRobotSocket(server, b"2" * 32)
     DirectoryStore(folder / "store").put(object_name(before.entry.id, digest_of(data)), data)
     named = {
         "map": {"object": digest_of(data)}, "camera": {"fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0},
         "pixels": [], "descriptors": b"",
     }  # fmt: skip
 
-    async def see(robot: Robot, keep: str) -> tuple[str, str]:
+    async def see(robot: EnrolledRobotSocket, keep: str) -> tuple[str, str]:
         robot.enroll()
         await robot.connect()
         try:
