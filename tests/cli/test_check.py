@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from client_sdk.check.corrections import corrected
-from client_sdk.check.drive_check import DriveCheck, check_lines
+from client_sdk.check.drive_check import DriveCheck
 from client_sdk.check.findings import FaultKind, Finding
 from client_sdk.rigs.intrinsics import Intrinsics
-from rse_pf.cli.main import main, parser_of
+from rse_pf.cli.main import main
 from rse_pf.geometry import Camera
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
@@ -41,20 +41,6 @@ def test_what_is_certain_corrects_the_intrinsics_and_nothing_else_does() -> None
     assert len(changes) == 2
 
 
-def test_distortion_is_not_added_to_that_of_a_lens() -> None:
-    bent = Intrinsics(camera=CAMERA, distortion=(0.1, 0.0, 0.0, 0.0))
-    found = [finding(FaultKind.DISTORTION, -0.1, k1=-0.1)]
-
-    assert corrected(bent, found) == (bent, ())
-    assert corrected(Intrinsics(camera=CAMERA), found)[0].distortion[0] == -0.1
-
-
-def test_lines_say_what_it_costs_and_what_to_do() -> None:
-    told = {"findings": [finding(FaultKind.BLUR, 0.5).to_dict()], "cannot_tell": [], "frames": 9}
-
-    assert check_lines(told) == ["check: it is off; it bends the path by about 20.0 cm; set it"]
-
-
 def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
     check = DriveCheck(is_wanted=True)
     check.add(None, None)  # type: ignore[arg-type]  # a frame that it cannot read
@@ -63,33 +49,6 @@ def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.
     (line,) = check.lines(told)
     assert line.startswith("check: it failed (AttributeError")
     assert "--no-check" in line
-
-
-def test_no_check_leaves_it_out() -> None:
-    parsed = parser_of("map").parse_args(["from-camera", "0", "--no-check"])
-    check = DriveCheck(is_wanted=parsed.check)
-
-    assert check.finish() is None
-    assert check.lines(None) == []
-
-
-def test_results_of_a_map_say_what_was_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "trajectory.txt").write_text("# none\n")
-    told = {"findings": [finding(FaultKind.BLUR, 0.5).to_dict()], "cannot_tell": [], "frames": 9}
-    (tmp_path / "report.json").write_text(json.dumps({"frames": 9, "check": told}))
-
-    assert main(["check", str(tmp_path)]) == 1
-    assert "it is off" in capsys.readouterr().out
-
-
-def test_results_that_were_not_checked_name_the_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "trajectory.txt").write_text("# none\n")
-    (tmp_path / "report.json").write_text('{"frames": 9}')
-
-    assert main(["check", str(tmp_path)]) == 2
-    assert "check the recording itself" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -142,20 +101,6 @@ def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
     assert report["findings"][0]["value"] == pytest.approx(0.1, abs=0.02)
     assert json.loads((tmp_path / "better.json").read_text())["depth_scale"] == pytest.approx(1000, rel=0.02)
     assert "depth scale is set" in capsys.readouterr().out
-
-
-def test_odometry_beside_the_images_knows_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("cv2")
-    from client_sdk.simulator import render_frames, true_trajectory
-    from tests.kit.tum_recording import write_tum
-
-    write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
-    (tmp_path / "groundtruth.txt").rename(tmp_path / "odometry.txt")
-    code = main(["check", str(tmp_path)])
-    assert (code, "depth scale is set" in capsys.readouterr().out) == (1, True)
-    (tmp_path / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
-    assert main(["check", str(tmp_path)]) == 2
-    assert "holds 1 poses" in capsys.readouterr().err
 
 
 def test_nothing_is_advised_while_the_source_has_a_finding(

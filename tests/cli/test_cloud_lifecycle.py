@@ -12,7 +12,6 @@ import pytest
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.cli.main import main
-from rse_pf.errors import StoreError
 from tests.kit.account_on_moto import Formation, Killer, account_of
 
 REGION = "ap-northeast-2"
@@ -68,17 +67,6 @@ def test_nothing_is_changed_before_somebody_agrees(
     assert cloud.deployed == []
 
 
-def test_where_nobody_can_be_asked_the_option_is_named(
-    cloud: Formation, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-
-    assert main(["cloud", "up"]) == 2
-
-    assert capsys.readouterr().err.splitlines()[-1] == "  hint: read the plan above, then add --yes"
-    assert cloud.deployed == []
-
-
 @pytest.mark.parametrize("action", ["park", "resume"])
 def test_what_does_not_stand_is_neither_parked_nor_resumed(
     cloud: Formation, capsys: pytest.CaptureFixture[str], action: str
@@ -97,18 +85,6 @@ def test_what_the_account_lacks_stops_up_before_the_question(
     page = capsys.readouterr().out
     assert "fail  AWS does not offer x9z.large" in page
     assert cloud.deployed == []
-
-
-def test_a_service_that_does_not_answer_is_no_finding(
-    cloud: Formation, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def silent(*args: object) -> None:
-        raise StoreError("AWS does not answer: HTTP status 503")
-
-    monkeypatch.setattr("rse_pf.aws.money.leftovers.find_leftovers", silent)
-
-    assert main(["cloud", "leftovers"]) == 2
-    assert "HTTP status 503" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -142,8 +118,3 @@ def test_a_day_up_parked_resumed_and_down_with_proof(
     code, page = run("down", "--delete-data", "--yes", "--confirm", "rse-pf")
     assert code == 0
     assert page.endswith("0 left over, 0 resources kept on purpose\n")
-
-
-def test_data_is_deleted_only_under_its_name(cloud: Formation, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["cloud", "down", "--delete-data", "--yes", "--confirm", "other"]) == 2
-    assert "hint: it is rse-pf" in capsys.readouterr().err

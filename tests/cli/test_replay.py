@@ -81,17 +81,6 @@ def test_replay_lists_what_went_wrong_worst_first(
 
 
 @pytest.mark.usefixtures("quick")
-def test_json_of_a_recording_has_the_counts_and_the_troubles(
-    recording: tuple[Path, dict[str, str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    seen = as_json(capsys, recording[0])
-
-    assert (seen["commands"], seen["equal"], seen["different"]) == (3, 3, 0)
-    assert seen["by_kind"] == {"failed": 1, "weak": 1}
-    assert [each["id"] for each in seen["troubles"]] == [recording[1]["failed"], recording[1]["weak"]]
-
-
-@pytest.mark.usefixtures("quick")
 def test_a_command_is_shown_with_its_evidence_and_on_a_page(
     recording: tuple[Path, dict[str, str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,18 +100,6 @@ def test_a_command_is_shown_with_its_evidence_and_on_a_page(
     assert "on the thumbnail of the frame" in text
     for outside in ("http:", "https:", "<script", 'src="/', "url("):
         assert outside not in text
-
-
-@pytest.mark.usefixtures("quick")
-def test_other_options_are_tried(
-    recording: tuple[Path, dict[str, str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, names = recording
-
-    out = printed(capsys, folder, "--command", names["good"], "--inlier-px", "3", "--max-iterations", "2000")
-
-    assert "what you asked for:" in out
-    assert "--inlier-px 3 --max-iterations 2000" in out
 
 
 @pytest.mark.usefixtures("quick")
@@ -187,24 +164,3 @@ def test_a_hostile_file_costs_one_line(tmp_path: Path, kind: str, capsys: pytest
     told = capsys.readouterr()
     assert (code, told.out) == (1, "")
     assert len(told.err.splitlines()) == 2
-
-
-def test_a_command_is_replayed_in_a_process_with_limits(
-    recording: tuple[Path, dict[str, str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, names = recording
-
-    assert "equal to the byte" in printed(capsys, folder, "--command", names["good"])
-
-
-@pytest.mark.usefixtures("quick")
-def test_where_nothing_went_wrong_it_says_who_judges_the_calibration(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = Made(tmp_path / "rec")
-    made.send(1)
-
-    out = printed(capsys, made.close())
-
-    assert "no command went wrong" in out
-    assert "rse-pf check" in out

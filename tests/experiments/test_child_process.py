@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -48,27 +47,6 @@ def test_a_token_before_the_start_is_not_taken_for_the_start() -> None:
         assert token.result(10) == "token-1"
         parent.send(7.5)
         assert start.result(10) == 7.5
-
-
-def test_two_threads_that_ask_at_once_both_get_a_token() -> None:
-    robot, parent = pair([0.0])
-    threading.Thread(target=answer, args=(parent, 2), daemon=True).start()
-    with workers(parent) as pool:
-        asked = [pool.submit(robot.fresh_token) for _ in range(2)]
-        assert {each.result(10) for each in asked} == {"token-1", "token-2"}
-
-
-def test_uploads_get_a_new_token_only_when_theirs_has_aged() -> None:
-    clock = [0.0]
-    robot, parent = pair(clock)
-    threading.Thread(target=answer, args=(parent, 2), daemon=True).start()
-
-    first = robot.token()
-    clock[0] = 59.0
-    again = robot.token()
-    clock[0] = 61.0
-
-    assert (first, again, robot.token()) == ("token-1", "token-1", "token-2")
 
 
 def test_the_end_of_the_parent_ends_every_wait() -> None:

@@ -141,15 +141,6 @@ def test_a_page_behind_a_forwarded_port_is_served_to_itself_only(host: str) -> N
     assert page.ask("POST", "/act", order, {**session, "host": host, "origin": f"http://{HOST}"})[0] == 403
 
 
-def test_a_key_that_was_used_is_refused() -> None:
-    page = Page()
-    _, _, body = page.ask("POST", "/keys", {"role": "view"}, {"authorization": f"Bearer {ADMIN}"})
-    key = json.loads(body)["key"]
-
-    assert page.ask("POST", "/session", {"key": key})[0] == 200
-    assert page.ask("POST", "/session", {"key": key})[0] == 401
-
-
 def test_only_an_operator_operates() -> None:
     page = Page()
     viewer, operator = page.session(), page.session("operate")
@@ -161,15 +152,6 @@ def test_only_an_operator_operates() -> None:
     assert page.done == [("kill", {"server": "server-1"})]
     status, _, body = page.ask("POST", "/act", {"action": "drain"}, operator)
     assert (status, json.loads(body)["message"]) == (400, r"\x1b it is the last")
-
-
-@pytest.mark.parametrize("body", [b"", b"[]", b"{" * 3000, b"\xff", {"key": 5}, {"key": ""}, b"[" * 4000])
-def test_a_body_that_is_none_is_refused(body: Any) -> None:
-    assert Page().ask("POST", "/session", body)[0] == 400
-
-
-def test_a_body_that_is_too_long_is_refused() -> None:
-    assert Page().ask("POST", "/session", {"key": "x" * 5000})[0] == 413
 
 
 @pytest.mark.parametrize(
@@ -193,16 +175,6 @@ def test_every_answer_has_the_policy_that_forbids_scripts_of_others() -> None:
         assert headers["x-content-type-options"] == "nosniff"
     assert "default-src 'none'" in CONTENT_SECURITY_POLICY
     assert "unsafe" not in CONTENT_SECURITY_POLICY
-
-
-def test_a_file_that_the_browser_has_is_not_sent_again() -> None:
-    page = Page()
-    _, headers, body = page.ask("GET", "/main.js")
-
-    status, _, again = page.ask("GET", "/main.js", None, {"if-none-match": headers["etag"]})
-
-    assert (status, again) == (304, b"")
-    assert body == FILES["/main.js"].data
 
 
 def test_a_session_reads_the_stream_and_too_many_pages_are_refused() -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from rse_pf.audit.entry import Entry, entry_line
 from rse_pf.extensions.fleet_page.feeds.audit_log import AuditRows, audit_sentence
-from rse_pf.extensions.fleet_page.feeds.file_tail import FileTail
 
 
 class Writer:
@@ -115,17 +114,6 @@ def test_a_file_that_is_renamed_is_read_to_its_end(tmp_path: Path) -> None:
     ]
 
 
-def test_events_of_the_platform_are_told_from_the_log_only_if_nobody_heard_them(tmp_path: Path) -> None:
-    writer, rows = Writer(tmp_path, "control-plane"), AuditRows(tmp_path)
-    writer.add("platform.server-launched", "server-1", time=1.0, pid=7)
-    writer.add("platform.server-healthy", "server-1", time=5.0)
-
-    told, events = rows.new_rows(lambda entry: entry.time > 3.0)
-
-    assert told == []
-    assert events == [{"event": "server-launched", "server": "server-1", "pid": 7, "time_s": 1.0}]
-
-
 def test_hostile_names_are_escaped_and_a_flood_is_bounded(tmp_path: Path) -> None:
     writer, rows = Writer(tmp_path, "server-1"), AuditRows(tmp_path)
     writer.add("auth.accepted", "\x1b[2J<img src=x>\u202e")
@@ -136,18 +124,3 @@ def test_hostile_names_are_escaped_and_a_flood_is_bounded(tmp_path: Path) -> Non
         writer.add("auth.accepted", "robot-1")
     assert len(rows.new_rows()[0]) == 200
     assert rows.skipped == 800
-
-
-def test_a_tail_begins_with_a_whole_line_and_is_bounded(tmp_path: Path) -> None:
-    file, tail = tmp_path / "log", FileTail()
-    file.write_bytes(b"".join(b"%07d\n" % number for number in range(100_000)))
-
-    first = tail.new_lines(file)
-    with file.open("ab") as opened:
-        opened.write(b"x" * (3 << 20) + b"\nlast\n")
-
-    assert first[-1] == b"0099999"
-    assert 32_000 < len(first) < 33_000
-    assert {len(line) for line in first} == {7}
-    assert tail.new_lines(file) == [b"last"]
-    assert tail.new_lines(tmp_path / "missing") == []

@@ -13,11 +13,11 @@ import pytest
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
 from rse_pf.aws.fleet.group_metrics import PERIODS, GroupMetrics
-from rse_pf.aws.fleet.overview import CloudBalancer, CloudOverview, ScalingActivity
+from rse_pf.aws.fleet.overview import CloudBalancer, CloudOverview
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, ConfigurationError
 from rse_pf.extensions.fleet_page.cloud_page import serve_cloud_page
-from rse_pf.extensions.fleet_page.feeds.cloud_feed import CloudFeed, cloud_document, new_events
+from rse_pf.extensions.fleet_page.feeds.cloud_feed import CloudFeed, cloud_document
 from rse_pf.extensions.fleet_page.hub import Hub
 
 SETTINGS = PlatformSettings()
@@ -62,13 +62,6 @@ def test_the_boxes_show_what_aws_knows_and_say_what_it_does_not() -> None:
     assert json.loads(json.dumps(told)) == told
 
 
-def test_without_any_number_nothing_is_zero() -> None:
-    told = cloud_document(overview(HEALTHY), GroupMetrics(period_s=60), SETTINGS, time_s=NOW_S)
-
-    assert [told[name] for name in ("robots", "requests", "cpu_percent", "queue_ms")] == [None] * 4
-    assert told["waiting"] == ["no whole period of 60 s was measured yet"]
-
-
 @pytest.mark.parametrize(
     ("state", "targets", "shown"),
     [
@@ -91,21 +84,6 @@ def test_the_states_of_aws_are_told_in_the_words_of_a_local_platform(
     assert told["state"] == shown
 
 
-@pytest.mark.parametrize(
-    ("cpu", "first"),
-    [
-        ((75.0, 76.0, None), "2 of 2 samples above 70 %: one more server starts"),
-        ((75.0, None, 76.0), "1 of 2 samples above 70 %: one more server starts after one further such"),
-        ((75.0, 76.0, None, None, None), "no whole period of 60 s was measured yet"),
-        ((30.0,), "the servers are neither busy nor idle"),
-    ],
-)
-def test_the_alarms_wait_for_what_the_policy_waits_for(cpu: tuple[float | None, ...], first: str) -> None:
-    told = cloud_document(overview(HEALTHY), metrics(cpu), SETTINGS, time_s=NOW_S)["waiting"]
-
-    assert told[0].startswith(first)
-
-
 def test_an_alarm_and_a_missing_server_are_told_with_the_runbook() -> None:
     alarmed = overview(HEALTHY, wanted=2, alarms={"silent": "ALARM"}, reasons={"silent": "no data\x1b"})
 
@@ -113,26 +91,6 @@ def test_an_alarm_and_a_missing_server_are_told_with_the_runbook() -> None:
 
     assert told[0] == "the group wants 2 servers and has 1"
     assert told[-1] == r"alarm silent is in state ALARM: no data\x1b (docs/operations.md#silent)"
-
-
-def test_what_happened_between_two_looks_is_told_once() -> None:
-    launch = ScalingActivity(id="1", began_s=5.0, status="InProgress", text="Launching i-2.", cause="busy")
-    first = dataclasses.replace(overview(HEALTHY), activities=(launch,))
-    failed = dataclasses.replace(launch, status="Failed")
-    sick = dataclasses.replace(HEALTHY, targets=("unhealthy",))
-    then = dataclasses.replace(overview(sick, alarms={"silent": "ALARM", "busy": "OK"}), activities=(failed,))
-
-    assert [each["kind"] for each in new_events(None, first, time_s=9.0)] == ["group-activity"]
-    told = new_events(first, then, time_s=9.0)
-    assert [(each["kind"], each["group"], each["time_s"]) for each in told] == [
-        ("group-activity", "trouble", 5.0),
-        ("alarm-silent", "trouble", 9.0),
-        ("server-unhealthy", "trouble", 9.0),
-    ]
-    assert new_events(then, then, time_s=10.0) == []
-    assert [each["text"] for each in new_events(then, overview(alarms=then.group.alarms), time_s=10.0)] == [
-        "i-1 has left the group"
-    ]
 
 
 class Refusing(Account):

@@ -29,21 +29,6 @@ def test_weak_and_failed_commands_are_told_and_others_are_not(tmp_path: Path) ->
     assert rows[0]["reason"] == "few-inliers"
 
 
-def test_each_line_is_told_once_and_only_when_it_is_complete(tmp_path: Path) -> None:
-    file, log = tmp_path / "server-1.log", CommandLog(tmp_path)
-    whole = line(robot="a")
-    file.write_text(whole + whole[:20])
-    assert len(log.new_rows()) == 1
-
-    with file.open("a") as opened:
-        opened.write(whole[20:])
-    assert len(log.new_rows()) == 1
-    assert log.new_rows() == []
-
-    file.write_text(line(robot="new"))  # it was set aside, and begun anew
-    assert [row["robot"] for row in log.new_rows()] == ["new"]
-
-
 def test_hostile_texts_are_escaped_and_cut(tmp_path: Path) -> None:
     (tmp_path / "server-1.log").write_text(
         line(robot="\x1b[2J\u202e<img src=x>", trace="t" * 9999, id={"a": 1})
@@ -54,12 +39,3 @@ def test_hostile_texts_are_escaped_and_cut(tmp_path: Path) -> None:
     assert row["robot"] == r"\x1b[2J\u202e<img src=x>"
     assert len(row["trace"]) == 200
     assert row["id"] == "{'a': 1}"
-
-
-def test_a_flood_of_failures_costs_a_bounded_number_of_rows(tmp_path: Path) -> None:
-    log = CommandLog(tmp_path)
-    log.new_rows()
-    (tmp_path / "server-1.log").write_text(line(robot="a") * 50_000)
-
-    assert len(log.new_rows()) <= 200
-    assert log.skipped > 0

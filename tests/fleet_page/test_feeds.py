@@ -12,18 +12,15 @@ import pytest
 
 from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError, UsageError
+from rse_pf.errors import RsePfError
 from rse_pf.extensions.fleet_page import clouds
-from rse_pf.extensions.fleet_page.feeds.events import group_of
-from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories, plain
+from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories
 from rse_pf.extensions.fleet_page.feeds.platform_feed import (
     LocalFeed,
     fleet_document,
-    moved_robots,
 )
 from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.geometry import Camera
-from rse_pf.local.control.operations import Operations
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.processes.limited import LimitedProcesses
@@ -43,25 +40,6 @@ def test_every_text_of_the_fleet_is_escaped() -> None:
     assert told["servers"][0]["name"] == r"<b>\u202e"
     assert told["last_action"] == r"a\nb"
     assert json.loads(json.dumps(told)) == told
-
-
-def test_robots_that_moved_are_found_and_new_ones_are_not() -> None:
-    before = {"a": "server-1", "b": "server-1"}
-
-    assert moved_robots(before, {"a": "server-2", "b": "server-1", "c": "server-2"}) == [
-        ("a", "server-1", "server-2")
-    ]
-
-
-@pytest.mark.parametrize(
-    ("kind", "group"),
-    [
-        ("server-killed", "fault"), ("server-gone", "trouble"), ("replace", "scaling"),
-        ("robot-moved", "scaling"), ("audit-token", "audit"), ("platform-ready", "other"),
-    ],
-)  # fmt: skip
-def test_events_are_found_under_their_filter(kind: str, group: str) -> None:
-    assert group_of(kind) == group
 
 
 def flat(x: float, angle: float = 0.0) -> list[float]:
@@ -125,12 +103,6 @@ def test_answer_times_are_known_after_two_readings_that_nobody_asked_for(
     assert told == [(0, 0.0), (400, 1.0), (2400, 6.0)]
 
 
-def test_values_of_a_live_map_become_plain_and_escaped() -> None:
-    assert plain({"a\x1b": (np.float64(1.5), np.arange(3), "b\x07", None)}) == {
-        r"a\x1b": [1.5, [0, 1, 2], r"b\x07", None]
-    }
-
-
 def test_a_map_is_packed_within_a_fraction_of_a_millimetre_and_its_first_points_are_a_sample(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -162,16 +134,6 @@ def test_a_map_is_packed_within_a_fraction_of_a_millimetre_and_its_first_points_
     assert np.abs(shades[order].astype(int) - colours).max() <= 1
     assert np.abs(np.quantile(blocks[0][0][:, 0], [0.25, 0.5, 0.75]) - [-2.5, 0.0, 2.5]).max() < 0.6
     assert told["robots"] == {r"a\x1b": [[0.0, 0.0, 0.0]]}
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 10, 997, 1000, 4096])
-def test_any_beginning_of_the_order_of_points_is_spread_over_all(count: int) -> None:
-    order = clouds.spread_order(count)
-
-    assert sorted(order) == list(range(count))
-    for length in (1, count // 7, count // 2):
-        gaps = np.diff([-1, *sorted(order[:length]), count])
-        assert gaps.max() <= 4 * count / (length + 1) + 1
 
 
 async def test_the_cloud_that_a_page_shows_first_is_packed_once_and_before_it_is_asked_for(
@@ -214,25 +176,6 @@ async def test_versions_of_all_tenants_are_listed_and_read_under_the_name_of_the
     for label in ("yard", "other/hall", "acme/../hall"):
         with pytest.raises(RsePfError):
             await pages.cloud({"map": label})
-
-
-async def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:
-    kept: list[Any] = []
-    operations = Operations(kept.append)
-    watched = operations.watch(lambda: {"servers": 2})
-    assert await watched.__anext__() == {"state": {"servers": 2}}
-    operations.take_event({"event": "server-killed", "server": "server-1"})
-    told = await asyncio.wait_for(watched.__anext__(), 2.0)
-    assert (told["event"], told["number"]) == ("server-killed", 1)
-
-    others = [operations.watch(dict) for _ in range(7)]
-    for each in others:
-        await each.__anext__()
-    with pytest.raises(UsageError):
-        operations.watch(dict)
-    for each in (watched, *others):
-        await each.aclose()
-    await operations.watch(dict).__anext__()
 
 
 def test_the_page_may_read_every_live_map_and_do_nothing_else() -> None:

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.errors import Busy
-from rse_pf.extensions.fleet_page.hub import MAX_PAGES, Hub
+from rse_pf.extensions.fleet_page.hub import Hub
 
 ALL = frozenset(("fleet", "event"))
 
@@ -21,40 +20,6 @@ def told(message: bytes) -> Any:
 
 async def next_of(messages: AsyncGenerator[bytes, None], count: int) -> list[Any]:
     return [told(await asyncio.wait_for(messages.__anext__(), 5.0)) for _ in range(count)]
-
-
-async def test_a_new_page_is_told_what_is_known_and_then_what_is_new() -> None:
-    hub = Hub()
-    hub.put("fleet", "now", {"robots": 3})
-    hub.append("event", {"text": "first"})
-    hub.put("robots", "now", [])
-    messages = hub.messages(ALL)
-    await messages.__anext__()
-
-    known = await next_of(messages, 2)
-    hub.append("event", {"text": "second"})
-    (new,) = await next_of(messages, 1)
-    await messages.aclose()
-
-    assert [each["topic"] for each in known] == ["event", "fleet"]
-    assert new["value"] == {"text": "second"}
-    assert hub.pages == 0
-
-
-async def test_two_hundred_pages_are_not_all_served() -> None:
-    hub = Hub()
-    opened = [hub.messages(ALL) for _ in range(200)]
-    served = 0
-    for each in opened:
-        try:
-            await each.__anext__()
-            served += 1
-        except Busy:
-            continue
-    assert (served, hub.pages, hub.refused) == (MAX_PAGES, MAX_PAGES, 200 - MAX_PAGES)
-    for each in opened:
-        await each.aclose()
-    assert hub.pages == 0
 
 
 async def test_a_page_that_does_not_read_gets_the_newest_value_only() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import random
 
-import pytest
-
 from rse_pf.config import ScalingSettings
 from rse_pf.extensions.fleet_page.feeds.events import event_sentence
 from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
@@ -21,32 +19,6 @@ def policy(*samples: tuple[float, float], **more: object) -> dict[str, object]:
         for number, (cpu, requests) in enumerate(samples)
     ]
     return {"elastic": True, "samples": told, "min_servers": 1, "max_servers": 8, **more}
-
-
-@pytest.mark.parametrize(
-    ("cpus", "servers", "sentence"),
-    [
-        ((75.0,), 2, "1 of 2 samples above 70 %: one more server starts after one further such sample"),
-        ((10.0, 75.0, 80.0), 2, "2 of 2 samples above 70 %: one more server starts"),
-        ((75.0, 80.0), 8, "2 of 2 samples above 70 %, but 8 servers are the most that are allowed"),
-        ((75.0, 30.0), 2, "the servers are neither busy nor idle"),
-    ],
-)
-def test_busy_servers_are_counted_in_words(cpus: tuple[float, ...], servers: int, sentence: str) -> None:
-    (said,) = waiting_for(policy(*((cpu, 9.0) for cpu in cpus)), SETTINGS, servers=servers)
-
-    assert said.startswith(sentence)
-
-
-def test_idle_servers_are_counted_in_words() -> None:
-    idle = [(1.0, 0.0)] * 3
-
-    assert waiting_for(policy(*idle), SETTINGS, servers=2) == [
-        "3 of 5 samples idle: one server leaves after two further idle samples"
-    ]
-    assert waiting_for(policy(*idle), SETTINGS, servers=1) == [
-        "3 of 5 samples idle: nothing happens, one server is the fewest that are allowed"
-    ]
 
 
 def test_the_sentence_announces_what_the_policy_decides() -> None:
@@ -73,12 +45,6 @@ def test_the_sentence_announces_what_the_policy_decides() -> None:
         assert (action.kind == "grow") == ("more server" in said and "after" not in said), (rows, said)
         assert (action.kind == "shrink") == ("leaves now" in said), (rows, said)
     assert min(grown, shrunk) > 20
-
-
-def test_a_modifier_that_is_off_and_a_first_period_are_told() -> None:
-    assert "off" in waiting_for({"elastic": False}, SETTINGS, servers=2)[0]
-    assert "no whole period" in waiting_for(policy(), SETTINGS, servers=2)[0]
-    assert "too soon" in waiting_for(policy((1.0, 1.0), crash_loop=True), SETTINGS, servers=2)[0]
 
 
 def test_events_are_sentences_also_without_details_and_with_unknown_kinds() -> None:

@@ -7,27 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from rse_pf.local.disk_watch import DiskWatch, disk_level, disk_spaces, folders_of
-
-MIB = 1 << 20
-
-
-def test_a_disk_is_low_below_a_tenth_and_full_below_a_mebibyte():
-    assert [disk_level(free, 1000 * MIB) for free in (200 * MIB, 99 * MIB, MIB - 1)] == ["ok", "low", "full"]
-
-
-def test_a_disk_at_the_threshold_does_not_change_its_level_with_every_write():
-    assert disk_level(105 * MIB, 1000 * MIB, "low") == "low"
-    assert disk_level(111 * MIB, 1000 * MIB, "low") == "ok"
-    assert disk_level(MIB + 1, 1000 * MIB, "full") == "full"
-
-
-def test_folders_on_one_disk_are_one_disk_and_a_store_elsewhere_is_none(tmp_path: Path):
-    (space,) = disk_spaces(folders_of(tmp_path, f"dir:{tmp_path}/objects"))
-
-    assert space.folder == str(tmp_path)
-    assert 0 < space.free_bytes <= space.total_bytes
-    assert folders_of(tmp_path, "s3:bucket") == [tmp_path]
+from rse_pf.local.disk_watch import DiskWatch
 
 
 def test_each_change_is_one_event_that_names_folder_and_bytes(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import os
 import resource
@@ -16,8 +15,6 @@ import pytest
 
 from rse_pf.local.processes import (
     ProcessMark,
-    ServerProcess,
-    ended,
     is_alive,
     last_line,
     mark_of,
@@ -47,11 +44,6 @@ def marked(process: subprocess.Popen[bytes]) -> ProcessMark:
     return mark
 
 
-def test_a_mark_stays_the_same_while_the_process_lives(child: subprocess.Popen[bytes]) -> None:
-    assert mark_of(child.pid) == mark_of(child.pid)
-    assert is_alive(marked(child))
-
-
 def test_a_process_that_re_uses_the_pid_is_not_signalled(child: subprocess.Popen[bytes]) -> None:
     earlier = dataclasses.replace(marked(child), began="1@another-boot")
 
@@ -59,43 +51,6 @@ def test_a_process_that_re_uses_the_pid_is_not_signalled(child: subprocess.Popen
     assert not send_signal(earlier, signal.SIGKILL)
     assert wait_ended(earlier, 0.0)
     assert child.poll() is None
-
-
-def test_the_right_process_is_signalled_and_its_end_is_noticed(child: subprocess.Popen[bytes]) -> None:
-    mark = marked(child)
-
-    assert not wait_ended(mark, 0.0)
-    assert send_signal(mark, signal.SIGKILL)
-    assert wait_ended(mark, SOON_S)
-    assert child.wait() == -signal.SIGKILL
-    assert not send_signal(mark, signal.SIGKILL)
-
-
-def test_a_zombie_counts_as_gone(child: subprocess.Popen[bytes]) -> None:
-    mark = marked(child)
-    os.kill(child.pid, signal.SIGKILL)
-
-    assert wait_ended(mark, SOON_S)
-    assert mark_of(child.pid) is None
-
-
-async def test_the_end_can_be_awaited(child: subprocess.Popen[bytes]) -> None:
-    mark = marked(child)
-
-    early = await ended(mark, 0.0)
-    waiting = asyncio.create_task(ended(mark, SOON_S))
-    send_signal(mark, signal.SIGKILL)
-    assert (early, await waiting, await ended(mark)) == (False, True, True)
-
-
-def test_a_spawned_process_reads_nothing_and_writes_its_log(tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    told = "import os, sys; sys.stdin.read(); print(os.getcwd()); sys.stderr.write('last')"
-
-    process = spawn([sys.executable, "-c", told], log=log, folder=tmp_path, dies_with_parent=True)
-
-    assert process.wait(SOON_S) == 0
-    assert log.read_text().splitlines() == [str(tmp_path), "last"]
 
 
 @pytest.mark.parametrize("dies", [True, False])
@@ -168,10 +123,6 @@ def test_the_last_line_of_a_log_is_the_one_that_tells_most(tmp_path: Path, text:
     assert last_line(tmp_path / "log") == line
 
 
-def test_a_log_that_is_not_there_says_nothing(tmp_path: Path) -> None:
-    assert last_line(tmp_path / "none") == ""
-
-
 def test_a_long_log_begins_anew_and_its_lines_stay_in_its_predecessor(tmp_path: Path) -> None:
     long, short, other = (tmp_path / name for name in ("server-1.log", "server-2.log", "settings.json"))
     long.write_text("old\n" * 100)
@@ -186,37 +137,6 @@ def test_a_long_log_begins_anew_and_its_lines_stay_in_its_predecessor(tmp_path: 
     assert rotate_long_logs(tmp_path, 100) == []
 
 
-def test_a_predecessor_is_replaced_so_that_two_files_are_all(tmp_path: Path) -> None:
-    log = tmp_path / "server-1.log"
-    for word in ("first", "second", "third"):
-        log.write_text(word * 50)
-        rotate_long_logs(tmp_path, 100)
-
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["server-1.log", "server-1.log.1"]
-    assert (tmp_path / "server-1.log.1").read_text() == "third" * 50
-
-
-def test_a_process_goes_on_writing_at_the_new_beginning(tmp_path: Path) -> None:
-    """Its descriptor appends: else the file would begin with a hole as long as what was cut off."""
-    log, go = tmp_path / "server-1.log", tmp_path / "go"
-    told = (
-        "import os, time; print('x' * 500, flush=True)\n"
-        "open('wrote', 'w').close()\n"
-        "while not os.path.exists('go'): time.sleep(0.01)\n"
-        "print('after', flush=True)"
-    )
-    process: subprocess.Popen[bytes] = spawn(
-        [sys.executable, "-c", told], log=log, folder=tmp_path, dies_with_parent=True
-    )
-    while not (tmp_path / "wrote").exists():
-        assert process.poll() is None
-    rotate_long_logs(tmp_path, 100)
-    go.touch()
-    assert process.wait(10) == 0
-
-    assert log.read_bytes() == b"after\n"
-
-
 @pytest.mark.parametrize("mode", [0o600, 0o644])
 def test_a_predecessor_is_as_private_as_the_log(tmp_path: Path, mode: int) -> None:
     log = tmp_path / "server-1.log"
@@ -225,16 +145,6 @@ def test_a_predecessor_is_as_private_as_the_log(tmp_path: Path, mode: int) -> No
     rotate_long_logs(tmp_path, 100)
 
     assert (tmp_path / "server-1.log.1").stat().st_mode & 0o777 == mode
-
-
-def test_a_process_that_is_started_again_appends_to_its_log_and_is_quoted_alone(tmp_path: Path) -> None:
-    process = ServerProcess("server-1", tmp_path)
-    for word, quoted in (("first", "first"), ("second", "second"), ("", "")):
-        process.start([sys.executable, "-c", f"print({word!r})"], dies_with_parent=True)
-        assert asyncio.run(process.wait_over()) == 0
-        assert process.last_line() == quoted
-
-    assert (tmp_path / "server-1.log").read_text().split() == ["first", "second"]
 
 
 def test_the_oldest_logs_of_ended_processes_are_removed_and_nothing_else(tmp_path: Path) -> None:

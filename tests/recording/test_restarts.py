@@ -90,16 +90,6 @@ def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key
     assert events == ["recorder-restarted"] * 5 + ["recorder-given-up"]
 
 
-def test_a_recorder_that_ended_because_the_workers_are_gone_is_not_started_again(tmp_path: Path):
-    recorders = FakeRecorders()
-
-    with recording(tmp_path, recorders) as recorded:
-        recorded.leave_to_workers()
-        recorders.wait_for(1).end(0)
-
-    assert len(recorders.plans) == 1
-
-
 def entries(end: int) -> list[Handed]:
     return list(PipeReader().entries(os.read(end, 1 << 20)))
 
@@ -138,24 +128,3 @@ def test_the_next_recorder_learns_of_open_connections_and_gets_what_waited():
     os.close(end)
     theirs.close()
     ours.close()
-
-
-def test_what_waits_for_the_next_recorder_stays_within_its_bound():
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    due: list[Callable[[], None]] = []
-    tap = RecordingTap(
-        hand_pipe(theirs.fileno()) or -1, call_later=lambda seconds, call: due.append(call),
-        renew=lambda: hand_pipe(theirs.fileno()),
-    )  # fmt: skip
-    number = tap.open_connection("bin", ROBOT)
-    _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
-    os.close(end)
-
-    for _ in range(200):
-        tap.observe_received(number, bytes(100_000))
-        if due:
-            due.pop()()
-
-    assert 0 < 200 - tap.dropped < 110
-    ours.close()
-    theirs.close()

@@ -17,7 +17,6 @@ from PIL import Image
 import client_sdk
 from client_sdk.frontend import Frame
 from rse_pf.config import PnpSettings, SessionSettings
-from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.extensions.recording.reader import open_recording
 from rse_pf.extensions.recording.robot_recorder import RobotRecorder
 from rse_pf.geometry import Camera
@@ -76,22 +75,6 @@ def test_a_robot_that_records_has_its_commands_and_answers_in_a_file(tmp_path: P
     assert "frames" not in found
 
 
-def test_the_recorder_learns_of_the_beginning_and_the_end_of_each_connection(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    ended: list[int] = []
-    close_connection = RobotRecorder.close_connection
-
-    def close(recorder: RobotRecorder, connection: int) -> None:
-        ended.append(connection)
-        close_connection(recorder, connection)
-
-    monkeypatch.setattr(RobotRecorder, "close_connection", close)
-    drive(tmp_path)
-
-    assert ended == [1]
-
-
 def test_pictures_are_small_and_only_there_if_the_robot_allows_them(tmp_path: Path):
     drive(tmp_path, thumbnails=True)
 
@@ -122,20 +105,6 @@ def test_neither_token_nor_tenant_nor_name_is_in_the_file(tmp_path: Path):
 
     (file,) = tmp_path.iterdir()
     assert not [word for word in (TOKEN, "acme", '"robot":"r"') if word.encode() in file.read_bytes()]
-
-
-def test_a_folder_that_cannot_be_written_is_refused_before_the_robot_connects(tmp_path: Path):
-    (tmp_path / "file").write_text("")
-
-    with pytest.raises(UsageError, match="is a file"):
-        drive(tmp_path / "file")
-
-
-def test_a_missing_package_is_told_by_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-
-    with pytest.raises(MissingExtra, match="mcap"):
-        RobotRecorder(tmp_path, thumbnails=False, session=SessionSettings()).start()
 
 
 def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path):

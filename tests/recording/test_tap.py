@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 from collections.abc import Callable, Iterator
@@ -10,10 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from rse_pf.extensions.recording.tap import (
-    CLOSED,
-    DOWN,
     LOST,
-    OPENED,
     UP,
     Handed,
     PipeReader,
@@ -60,25 +56,6 @@ def read(fd: int, reader: PipeReader) -> list[Handed]:
     except BlockingIOError:
         pass
     return found
-
-
-def test_all_entries_arrive_in_order_with_their_times(pipe: tuple[int, int]):
-    loop, times = Loop(), iter(range(100))
-    tap = RecordingTap(pipe[1], call_later=loop.call_later, time_ns=lambda: next(times))
-
-    number = tap.open_connection("bin", ROBOT)
-    tap.observe_received(number, b"asks")
-    tap.observe_sent(number, b"")
-    tap.close_connection(number)
-    assert len(loop.due) == 1
-    loop.turn()
-
-    found = read(pipe[0], PipeReader())
-    assert [(each.kind, each.connection, each.time_ns) for each in found] == [
-        (OPENED, 1, 0), (UP, 1, 1), (DOWN, 1, 2), (CLOSED, 1, 3),
-    ]  # fmt: skip
-    assert json.loads(found[0].data) == ["bin", *ROBOT]
-    assert [each.data for each in found[1:]] == [b"asks", b"", b""]
 
 
 def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[int, int]):

@@ -29,7 +29,7 @@ from rse_pf.identity import RobotId
 from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry
 from rse_pf.services import pnp
-from rse_pf.wire import CODECS, Command, Ping, Result, make_codec
+from rse_pf.wire import CODECS, Command, Ping, make_codec
 from tests.kit.worker_parts import worker_parts
 
 ROBOT = RobotId("default", "robot-seven")
@@ -130,27 +130,3 @@ def test_a_name_or_a_token_in_the_words_of_a_command_is_not_recorded(codec: str,
         assert kept is not None
         assert words.encode() not in kept.text
         assert make_codec(codec).decode_from_robot(kept.data).trace == redactor.robot
-
-
-def test_the_pose_of_a_command_that_was_left_out_is_left_out():
-    redactor = ConnectionRedactor(make_codec("bin"), ROBOT, Pseudonyms(b"k" * 32), max_inflated_bytes=1 << 20)
-
-    assert redactor.pose(5, b"answer") is None
-    assert redactor.left_out == 1
-
-
-def test_only_the_newest_message_of_a_tap_can_be_told(pipe: tuple[int, int]):
-    tap = RecordingTap(pipe[1], call_later=lambda seconds, call: None)
-    number = tap.open_connection("bin", ROBOT)
-    first, second = b"first", b"second"
-    tap.observe_received(number, first)
-    tap.observe_received(number, second)
-
-    tap.observe_command(first, command("bin"))
-    tap.observe_answer(second, command("bin"), Result(id=1, reply=None))
-    tap.observe_command(second, command("bin", trace="x" * 300))
-    tap.flush()
-    tap.observe_command(second, command("bin"))
-
-    found = list(PipeReader().entries(os.read(pipe[0], 1 << 20)))
-    assert [(each.kind, each.data) for each in found[1:]] == [(UP, first), (UP, second)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 from contextlib import suppress
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,7 @@ from mcap.stream_reader import StreamReader
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.extensions.recording.file_format import FileName
-from rse_pf.extensions.recording.writer import RecordingWriter, make_folder, with_recordings
+from rse_pf.extensions.recording.writer import RecordingWriter, with_recordings
 
 START = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -74,15 +72,6 @@ def test_the_oldest_files_are_deleted_but_none_that_is_being_written(tmp_path: P
         each.close()
 
 
-def test_a_recorder_that_starts_in_the_same_second_takes_another_name(tmp_path: Path):
-    both = [writer(tmp_path), writer(tmp_path)]
-    for each in both:
-        fill(each, 1)
-        each.close()
-
-    assert len(names(tmp_path)) == 2
-
-
 def test_a_full_disk_costs_messages_and_a_new_file_follows_when_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -124,21 +113,3 @@ def test_a_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path, 
 
     assert refused.value.hint
     assert "\n" not in refused.value.message
-
-
-def test_a_folder_is_made_and_nothing_is_recorded_by_default(tmp_path: Path):
-    chosen = with_recordings(PlatformSettings(), tmp_path / "a" / "b")
-
-    assert chosen.recording.folder == str(tmp_path / "a" / "b")
-    assert make_folder(tmp_path / "a" / "b").is_dir()
-    assert names(tmp_path / "a" / "b") == []
-    assert with_recordings(PlatformSettings(), None) == PlatformSettings()
-
-
-def test_the_name_of_a_file_says_when_and_where_it_was_begun():
-    name = FileName(datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc), "a/b", 7)
-
-    assert str(name) == "20260102T030405Z-a_b-0007.mcap"
-    assert FileName.parse(str(name)) == name._replace(server="a_b")
-    assert FileName.parse("my.mcap") is None
-    assert FileName.parse("20261399T000000Z-a-0001.mcap") is None

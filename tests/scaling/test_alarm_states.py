@@ -7,9 +7,8 @@ import dataclasses
 import pytest
 
 from rse_pf.config import ScalingSettings
-from rse_pf.errors import UsageError
 from rse_pf.scaling.alarms import Alarm, alarms_of
-from tests.kit.alarm_states import AlarmRule, State, Value, next_state, replay, statistic, value_of
+from tests.kit.alarm_states import AlarmRule, State, Value, next_state, replay, value_of
 
 RULE = AlarmRule(
     expression="m", comparison="GreaterThanOrEqualToThreshold", threshold=1.0, periods=3, datapoints=3,
@@ -68,30 +67,6 @@ def test_an_expression_has_the_value_of_metric_math(
     expression: str, point: dict[str, Value], expected: Value
 ) -> None:
     assert value_of(expression, point) == expected
-
-
-@pytest.mark.parametrize("expression", ["SEARCH('x')", "RATE(a)", "a +", "a ** 2", "a < b < c", "unknown"])
-def test_what_is_not_implemented_is_an_error_and_not_a_pass(expression: str) -> None:
-    with pytest.raises(UsageError, match="cannot evaluate"):
-        value_of(expression, {"a": 1.0, "b": 1.0, "c": 1.0})
-
-
-def test_a_rule_with_unknown_terms_is_refused() -> None:
-    with pytest.raises(UsageError, match="treatment"):
-        dataclasses.replace(RULE, missing="never")
-    with pytest.raises(UsageError, match="comparison"):
-        dataclasses.replace(RULE, comparison="EqualTo")
-
-
-def test_statistics_are_those_of_the_samples_of_a_period() -> None:
-    samples = [float(each) for each in range(1, 101)]
-
-    assert [statistic(samples, each) for each in ("Sum", "Average", "Minimum", "Maximum", "SampleCount")] == [
-        5050.0, 50.5, 1.0, 100.0, 100.0,
-    ]  # fmt: skip
-    assert (statistic(samples, "p95"), statistic([], "Sum")) == (95.0, None)
-    with pytest.raises(UsageError, match="statistic"):
-        statistic(samples, "TM(10%:90%)")
 
 
 def test_the_scaling_alarms_fire_and_resolve_as_the_policy_says() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.scaling.rebalance import MARGIN, MoveOrder, Totals, moves, pause_after_s, plan_order, share
+from rse_pf.scaling.rebalance import MoveOrder, Totals, moves, pause_after_s, plan_order, share
 
 fleets = st.lists(st.integers(0, 400), min_size=2, max_size=12).map(
     lambda counts: {f"server-{i + 1}": n for i, n in enumerate(counts)}
@@ -39,19 +39,9 @@ def test_a_new_server_gets_its_share_after_a_scale_out() -> None:
     assert handed == {"server-1": 14, "server-2": 13} or handed == {"server-1": 13, "server-2": 14}
 
 
-def test_nothing_moves_within_a_fifth_of_even() -> None:
-    assert moves({"server-1": 40, "server-2": 60}) == {}
-    assert moves({"server-1": 39, "server-2": 61}) == {"server-2": 1}
-
-
 @pytest.mark.parametrize("robots", [{}, {"server-1": 100}, {"server-1": 0, "server-2": 0}])
 def test_without_robots_or_other_servers_nothing_moves(robots: dict[str, int]) -> None:
     assert moves(robots) == {}
-
-
-def test_one_robot_more_than_the_others_is_even() -> None:
-    assert moves({"server-1": 2, "server-2": 1}) == {}
-    assert moves({"server-1": 2, "server-2": 0}) == {"server-1": 1}
 
 
 @given(fleets, st.floats(0, 100))
@@ -68,15 +58,6 @@ def test_all_end_within_the_margin_in_one_round_and_then_nothing_moves(
     assert low <= min(after.values())
     assert max(after.values()) <= high
     assert moves(after, percent / 100) == {}
-
-
-@given(fleets)
-def test_no_more_robots_move_than_must(robots: dict[str, int]) -> None:
-    low, high = even_range(robots, 100 * MARGIN)
-    must_leave = sum(max(0, n - high) for n in robots.values())
-    must_arrive = sum(max(0, low - n) for n in robots.values())
-
-    assert sum(moves(robots).values()) == max(must_leave, must_arrive)
 
 
 @given(fleets, st.integers(0, 2**32))
@@ -97,15 +78,6 @@ def test_it_converges_when_each_robot_goes_to_the_better_of_two_random_servers(
 
     assert moves(now) == {}
     assert sum(now.values()) == sum(robots.values())
-
-
-@given(st.integers(0, 500), st.integers(0, 500))
-def test_of_two_servers_each_knows_as_much_as_the_control_plane(a: int, b: int) -> None:
-    handed = moves({"a": a, "b": b})
-
-    # Whole numbers: the lower border may ask for one robot more than the upper one.
-    assert 0 <= handed.get("a", 0) - share(a, a + b, 2) <= 1
-    assert 0 <= handed.get("b", 0) - share(b, a + b, 2) <= 1
 
 
 @given(fleets)
@@ -157,10 +129,6 @@ def test_a_pause_doubles_with_each_order_that_moved_nobody_up_to_ten_minutes() -
     order = MoveOrder(robots=20, spread_s=1.0)
 
     assert [pause_after_s(order, within_s=5.0, failures=each) for each in (0, 1, 2, 9)] == [6, 12, 24, 600]
-
-
-def test_a_single_server_moves_no_robots() -> None:
-    assert share(100, 100, 1) == 0
 
 
 @pytest.mark.parametrize("servers", [2, 3, 5, 8])

@@ -43,28 +43,6 @@ def test_a_package_carries_the_merged_settings(assets: Path, tmp_path: Path) -> 
     assert server.serving.workers == 3
 
 
-def test_the_sums_name_every_file_of_the_package_once(assets: Path, tmp_path: Path) -> None:
-    package = staged(assets, SERVERS, PlatformSettings(), tmp_path / "out")
-
-    lines = (package / SUMS_FILE).read_text().splitlines()
-
-    assert sorted(line.split("  ")[1] for line in lines) == sorted(
-        file.name for file in package.iterdir() if file.name != SUMS_FILE
-    )
-    for line in lines:
-        digest, name = line.split("  ")
-        assert digest == hashlib.sha256((package / name).read_bytes()).hexdigest()
-
-
-def test_the_boot_files_travel_with_the_environment_and_the_script_of_the_user_data_does_not(
-    assets: Path, tmp_path: Path
-) -> None:
-    names = {file.name for file in staged(assets, SERVERS, PlatformSettings(), tmp_path / "out").iterdir()}
-
-    assert {"install.py", "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service"} <= names
-    assert "first_boot.py" not in names
-
-
 def test_the_same_input_gives_the_same_sums_and_another_setting_others(assets: Path, tmp_path: Path) -> None:
     def digest(folder: str, **groups: Any) -> str:
         return sums_digest(staged(assets, SERVERS, PlatformSettings.from_dict(groups), tmp_path / folder))
@@ -165,24 +143,6 @@ def test_the_function_carries_the_bytecode_of_its_python_and_the_same_each_time(
     assert b"/var/task/thing.py" in found[0]
 
 
-def test_the_wheel_of_the_packages_is_built_from_all_files_of_the_platform(repository: Path) -> None:
-    held = {file.relative_to(repository).as_posix() for file in _builder(repository)._sources()}
-
-    assert {"rse_pf/cli/main.py", "rse_pf/py.typed", "rse_pf/aws/money/prices.json"} <= held
-    assert "rse_pf/services/custom/templates/lua/service.lua" in held
-    assert not [name for name in held if name.endswith(".pyc")]
-
-
-def test_without_a_python_of_the_functions_version_a_line_says_what_is_slower(
-    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    builder = _builder(repository)
-    assert not builder._compile(tmp_path, "3.0", "/var/task")
-
-    assert "cold start" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_same_tree_gives_the_same_archive_whatever_its_times_and_owners(
     repository: Path, tmp_path: Path
 ) -> None:
@@ -231,19 +191,6 @@ def test_a_server_unpacks_what_the_builder_packs_where_it_was_compiled_for(repos
     assert set(SERVICES) | {"s3"} <= set(builder.APIS), (
         "the agent calls a service whose description is missing"
     )
-
-
-def test_our_wheels_commands_start_with_the_environments_python(repository: Path, tmp_path: Path) -> None:
-    (tmp_path / "site" / "rse_pf-1.dist-info").mkdir(parents=True)
-    (tmp_path / "bin").mkdir()
-    points = "[console_scripts]\nrse-pf = rse_pf.cli.main:main\n[other]\nx = y:z\n"
-    (tmp_path / "site" / "rse_pf-1.dist-info" / "entry_points.txt").write_text(points)
-
-    _builder(repository)._write_scripts(tmp_path / "site", tmp_path / "bin")
-
-    (script,) = (tmp_path / "bin").iterdir()
-    assert script.read_text().splitlines()[0] == "#!/opt/rse-pf/venv/bin/python"
-    assert "from rse_pf.cli.main import main" in script.read_text()
 
 
 def _builder(repository: Path) -> Any:

@@ -155,13 +155,6 @@ def test_context_of_the_command_line_is_refused(checkout: Checkout, context: dic
     assert "is not used" in told.value.message
 
 
-def test_what_the_cdk_itself_hands_on_is_no_bad_input(checkout: Checkout) -> None:
-    from app import check_context
-
-    written = checkout.document["context"]
-    check_context({**written, "aws:cdk:enable-path-metadata": True, "@aws-cdk/new:flag": 1}, written)
-
-
 @pytest.mark.system
 def test_python_app_py_says_it_without_a_traceback(checkout: Checkout, repository: Path) -> None:
     told = subprocess.run(

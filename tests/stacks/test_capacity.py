@@ -77,23 +77,9 @@ def test_spot_servers_stand_on_a_floor_on_demand_and_are_replaced_before_they_ar
     assert {"LaunchTemplateId", "Version"} <= policy["LaunchTemplate"]["LaunchTemplateSpecification"].keys()
 
 
-def test_several_types_alone_stay_on_demand() -> None:
-    (group,) = resources(cloud={"other_instance_types": "c6i.large"})["AutoScalingGroup"]
-    distribution = group["MixedInstancesPolicy"]["InstancesDistribution"]
-
-    assert distribution["OnDemandPercentageAboveBaseCapacity"] == 100
-    assert not group.get("CapacityRebalance")
-
-
 def test_each_entry_of_the_schedule_is_a_scheduled_action() -> None:
     actions = resources(scaling={"schedule": OFFICE, "time_zone": "Asia/Seoul"})["ScheduledAction"]
 
     assert [(each["Recurrence"], each["MinSize"], each["TimeZone"]) for each in actions] == [
         ("0 8 * * 1,2,3,4,5", 4, "Asia/Seoul"), ("30 18 * * 5,6", 1, "Asia/Seoul"),
     ]  # fmt: skip
-
-
-def test_universal_time_has_the_name_that_auto_scaling_knows() -> None:
-    (action,) = resources(scaling={"schedule": "daily 8:00 min 3"})["ScheduledAction"]
-
-    assert action["TimeZone"] == "Etc/UTC"

@@ -10,8 +10,6 @@ from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import KEYS_NAME, SERVICES_PREFIX
 from rse_pf.config.settings import LIVE_PORTS
-from rse_pf.errors import ConfigurationError
-from rse_pf.server.live_map.lease import lease_name
 
 Assembly = Any
 READ_LIKE_ANY_OBJECT = {"STANDARD_IA", "GLACIER_IR"}
@@ -60,34 +58,6 @@ def test_what_nobody_can_see_is_deleted_in_every_bucket(assembly: Assembly) -> N
         ]
         assert aborted == [{"DaysAfterInitiation": 1}], name
         assert former == [kept[name]], name
-
-
-def test_access_logs_end_and_maps_do_not(assembly: Assembly) -> None:
-    ends = {
-        name: [
-            each["ExpirationInDays"]
-            for each in rules(bucket)
-            if "ExpirationInDays" in each and "Prefix" not in each
-        ]
-        for name, bucket in buckets(assembly).items()
-    }
-
-    cloud = assembly.settings.cloud
-    assert ends == {
-        "AccessLogs": [cloud.log_days], "AuditLogs": [cloud.audit_days + 1], "Maps": [], "Artifacts": [],
-    }  # fmt: skip
-
-
-def test_former_versions_of_leases_do_not_pile_up(assembly: Assembly) -> None:
-    """A live map renews its lease twice a second: 172,800 versions in a day."""
-    short = {
-        each["Prefix"]: each["NoncurrentVersionExpiration"]["NoncurrentDays"]
-        for each in rules(buckets(assembly)["Maps"])
-        if "Prefix" in each
-    }
-
-    assert short == {"live/": 1, "jobs/": 1, "accounts/": 1}
-    assert lease_name("default", "m").startswith("live/")
 
 
 def test_an_identity_and_maps_are_copied_to_other_regions_and_nothing_else(assembly: Assembly) -> None:
@@ -165,12 +135,3 @@ def test_without_live_maps_no_port_is_open_between_servers(groups: Any, has_port
     from stacks.firewall import live_range
 
     assert (live_range(PlatformSettings.from_dict(groups)) is not None) == has_ports
-
-
-def test_ports_of_live_maps_that_no_firewall_can_name_are_refused() -> None:
-    pytest.importorskip("aws_cdk", reason="run make setup")
-    from stacks.firewall import live_range
-
-    with pytest.raises(ConfigurationError, match=r"live\.first_port = 0") as told:
-        live_range(PlatformSettings.from_dict({"live": {"first_port": 0}}))
-    assert told.value.hint

@@ -5,7 +5,6 @@ from __future__ import annotations
 import configparser
 import hashlib
 import io
-import json
 import shutil
 import zipfile
 from datetime import datetime, timezone
@@ -16,16 +15,10 @@ import pytest
 
 from lambda_pnp.keys import signed_request
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import ROSBRIDGE_PORT
 from stacks.boot.first_boot import fetched, signed_headers, verified
-from stacks.boot.install import environment_file, units_of
 
 NOW = datetime(2026, 11, 21, 6, 0, 0, tzinfo=timezone.utc)
 USER_DATA_BYTES = 16384
-FACTS = {
-    "server": "i-0abc", "bucket": "artifacts", "keys": "keys.json", "group": "rse-pf", "hook": "drain",
-    "launch": "launch",    "store": "s3:maps", "audit": "audit-logs",
-}  # fmt: skip
 
 
 def test_the_boot_script_signs_as_the_function_does() -> None:
@@ -64,14 +57,6 @@ def test_the_call_that_abandons_a_launch_is_signed_as_the_sdk_does(monkeypatch: 
     )
 
     assert ours["authorization"] == request.headers["Authorization"]
-
-
-def test_the_reason_of_a_failed_start_is_written_to_the_console(repository: Path) -> None:
-    after = unit(repository, "rse-pf.service")["Service"]["ExecStopPost"]
-
-    assert after.startswith("+"), "the user of the service may not write there"
-    assert "journalctl --unit=rse-pf" in after
-    assert "/dev/console" in after
 
 
 def test_the_script_with_its_facts_fits_into_the_user_data(assembly: Any) -> None:
@@ -117,12 +102,6 @@ def packed(files: dict[str, bytes], listed: dict[str, bytes] | None = None) -> t
 GOOD = {"install.py": b"import json", "a.whl": b"wheel"}
 
 
-def test_a_package_that_its_list_vouches_for_is_opened() -> None:
-    data, digest = packed(GOOD)
-
-    assert verified(data, digest).read("a.whl") == b"wheel"
-
-
 @pytest.mark.parametrize(
     ("files", "complaint"),
     [
@@ -145,15 +124,6 @@ def test_a_package_with_another_list_than_the_templates_is_refused() -> None:
 
     with pytest.raises(SystemExit, match="not the one that the template names"):
         verified(evil, digest)
-
-
-def test_a_package_without_a_list_is_refused() -> None:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("install.py", b"x")
-
-    with pytest.raises(SystemExit, match="not the one"):
-        verified(buffer.getvalue(), "0" * 64)
 
 
 def unit(repository: Path, name: str) -> configparser.ConfigParser:
@@ -211,31 +181,6 @@ def test_the_agent_makes_and_carries_the_token_that_the_server_asks_for(reposito
     assert all(wanted in line for line in (server["ExecStart"], server["ExecStartPre"], agent["ExecStart"]))
     assert server["ExecStartPre"].endswith(" --once"), "that is what makes it"
     assert server["User"] == agent["User"]
-
-
-def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
-    assert unit(repository, "rse-pf.service")["Service"]["Restart"] == "on-failure"
-
-
-def test_a_group_is_attached_exactly_when_its_unit_starts(assembly: Any) -> None:
-    units = units_of(json.loads(json.dumps(assembly.settings.to_dict())))
-    ports = {each.get("Port") for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")}
-
-    assert ("rse-pf-data.service" in units) == (assembly.settings.data.port in ports)
-    assert ("rse-pf-rosbridge.service" in units) == (ROSBRIDGE_PORT in ports)
-    assert (ROSBRIDGE_PORT in ports) == assembly.settings.serving.rosbridge
-    assert "rse-pf.service" in units
-
-
-def test_the_environment_file_holds_plain_words_only() -> None:
-    assert environment_file(FACTS).splitlines() == [
-        "SERVER_ID=i-0abc", "BUCKET=artifacts", "KEYS_NAME=keys.json", "GROUP=rse-pf", "HOOK=drain",
-        "LAUNCH_HOOK=launch",
-        "STORE=s3:maps", "AUDIT_BUCKET=audit-logs",
-    ]  # fmt: skip
-    for bad in ("", "a\nUser=root", "a b", '"', "$HOME"):
-        with pytest.raises(SystemExit, match="not a plain word"):
-            environment_file({**FACTS, "server": bad})
 
 
 def test_an_unknown_region_says_how_to_look_its_prefix_list_up() -> None:

@@ -39,12 +39,6 @@ def test_a_machine_that_says_nothing_never_joins(assembly: Any) -> None:
     }  # fmt: skip
 
 
-def test_the_machine_is_told_the_name_of_its_launch_hook(assembly: Any) -> None:
-    (template,) = assembly.all("AWS::EC2::LaunchTemplate")[:1]
-
-    assert NAMES.launch_hook in json.dumps(template["LaunchTemplateData"]["UserData"])
-
-
 def test_a_deployment_moves_no_server_and_keeps_the_version_that_they_run(assembly: Any) -> None:
     group = group_of(assembly.templates)
 

@@ -22,10 +22,6 @@ def alarm_metrics(assembly: Assembly, stack: str) -> int:
     )
 
 
-def endpoint_zones(assembly: Assembly) -> int:
-    return sum(len(each.get("SubnetIds", ())) for each in assembly.all("AWS::EC2::VPCEndpoint"))
-
-
 def volume_gb(assembly: Assembly) -> int:
     template = assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]
     size: int = template["BlockDeviceMappings"][0]["Ebs"]["VolumeSize"]
@@ -53,13 +49,6 @@ def test_a_line_of_the_bill_counts_what_the_templates_have(assembly: Assembly, w
     lines = [each for each in bill.lines if each.what.removesuffix(", of 10 s") == what]
 
     assert sum(line.count for line in lines) == COUNTED[what](assembly) > 0
-
-
-def test_every_endpoint_is_paid_for_in_each_of_its_zones(assembly: Assembly) -> None:
-    bill = bill_of(assembly.settings, load_prices())
-    hours = sum(line.count for line in bill.lines if line.what.startswith("endpoint of"))
-
-    assert hours == 730 * endpoint_zones(assembly)
 
 
 def test_nothing_that_is_paid_by_the_hour_is_missing_from_the_bill(assembly: Assembly) -> None:

@@ -40,16 +40,6 @@ def test_boot_files_and_lambda_carry_the_very_settings(assembly: Assembly) -> No
             assert {getattr(getattr(each, group), name) for each in carrying} == {expected}
 
 
-def test_what_can_be_tagged_carries_the_deployment_and_every_stack_tells_the_digest(
-    assembly: Assembly,
-) -> None:
-    for template in assembly.templates.values():
-        assert template["Outputs"]["Settings"]["Value"] == assembly.settings.digest()
-    for kind in ("AWS::EC2::VPC", "AWS::S3::Bucket", "AWS::Lambda::Function"):
-        for resource in assembly.all(kind):
-            assert {"Key": "rse-pf", "Value": "rse-pf"} in resource["Tags"]
-
-
 @pytest.mark.system
 async def test_local_servers_answer_with_the_digest_of_the_same_file(
     assembly: Assembly, tmp_path: Path

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from rse_pf.config.cloud_layout import ENDPOINT_SERVICES
 
 Assembly = Any
@@ -130,11 +128,6 @@ def test_every_action_of_every_role_has_a_user_in_code(assembly: Assembly, repos
     assert without == [], "actions without a user"
 
 
-def test_nobody_is_recorded_as_the_user_of_an_action_that_is_not_granted(assembly: Assembly) -> None:
-    for role in roles_of(assembly):
-        assert {action for action, _ in role.uses} <= role.actions, role.path
-
-
 def test_no_action_is_a_wildcard(assembly: Assembly) -> None:
     wide = {action for role in roles_of(assembly) for action in role.actions if "*" in action}
 
@@ -151,25 +144,3 @@ def test_every_endpoint_has_an_action_that_a_role_of_the_servers_uses(assembly: 
 
     assert services == set(ENDPOINT_SERVICES)
     assert {SERVICES_OF_ENDPOINTS[each] for each in services} <= used
-
-
-@pytest.mark.parametrize(
-    ("action", "source", "made"),
-    [
-        ("cloudwatch:PutMetricData", 'call(client, "put_metric_data")', True),
-        ("cloudwatch:PutMetricData", "client.put_metric_data()", True),
-        ("cloudwatch:PutMetricData", "client.put_metric_alarm()", False),
-        ("s3:GetObject", "urllib.request.urlopen(request)", True),
-        ("s3:DeleteObject", "self._client.get_object()", False),
-    ],
-)
-def test_a_call_is_found_by_the_name_of_its_action(action: str, source: str, made: bool) -> None:
-    assert calls(action, source) is made
-
-
-def test_a_user_that_does_not_exist_is_an_error(repository: Path) -> None:
-    assert "def allow" in source_of("stacks/permissions.py:allow", repository)
-    with pytest.raises(ValueError, match="not enough values"):
-        source_of("stacks/permissions.py:nobody", repository)
-    with pytest.raises(FileNotFoundError):
-        source_of("stacks/nothing.py", repository)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import READY_PATH, ROSBRIDGE_PORT
+from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S
@@ -184,15 +184,6 @@ def test_servers_reach_the_map_bucket_exactly_when_the_data_service_runs(assembl
     assert {*_listed(statement["Action"]), "s3:ListBucket"} <= let_through
 
 
-def test_no_target_group_belongs_to_a_service_that_does_not_run(assembly: Assembly) -> None:
-    settings = assembly.settings
-    ports = {settings.serving.port} | ({settings.data.port} if settings.data.enabled else set())
-    ports |= {ROSBRIDGE_PORT} if settings.serving.rosbridge else set()
-
-    groups = assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")
-    assert {each["Port"] for each in groups if each["TargetType"] != "lambda"} == ports
-
-
 def test_the_target_group_checks_the_control_port_as_the_settings_say(assembly: Assembly) -> None:
     health, serving = assembly.settings.health, assembly.settings.serving
     groups = assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")
@@ -219,14 +210,6 @@ def test_the_front_door_speaks_tls_unless_it_is_a_lab(assembly: Assembly) -> Non
         assert (listener["Port"], listener["Protocol"]) == (443, "HTTPS")
         assert listener["SslPolicy"] == "ELBSecurityPolicy-TLS13-1-2-Res-2021-06"
         assert url == "wss://robots.example.org/ws"
-
-
-def test_the_load_balancer_refuses_what_two_readers_may_understand_differently(assembly: Assembly) -> None:
-    balancer = assembly.one("AWS::ElasticLoadBalancingV2::LoadBalancer")
-    chosen = {each["Key"]: each["Value"] for each in balancer["LoadBalancerAttributes"]}
-
-    assert chosen["routing.http.desync_mitigation_mode"] == "strictest"
-    assert chosen["routing.http.drop_invalid_header_fields.enabled"] == "true"
 
 
 def test_nobody_outside_can_have_the_data_service_ask_its_store(assembly: Assembly) -> None:
@@ -263,13 +246,6 @@ def test_only_the_front_door_is_open_to_the_world(assembly: Assembly) -> None:
     ports = [(rule["IpProtocol"], rule["FromPort"], rule["ToPort"]) for rule in open_to_all]
     assert ports == [("tcp", front, front), ("icmp", 3, 4)], "the listener, and what a path's MTU needs"
     assert not [rule for rule in [*outward, *loose] if rule.get("CidrIp") == "0.0.0.0/0"]
-
-
-def test_routers_may_tell_the_largest_packet_through_every_control_list(assembly: Assembly) -> None:
-    entries = [each for each in assembly.all("AWS::EC2::NetworkAclEntry") if each["Protocol"] == 1]
-
-    assert [each["Icmp"] for each in entries] == [{"Type": 3, "Code": 4}] * 4
-    assert sorted(each.get("Egress", False) for each in entries) == [False, False, True, True]
 
 
 def test_instances_have_no_key_no_public_address_and_imdsv2_with_one_hop(assembly: Assembly) -> None:

@@ -71,15 +71,3 @@ def test_what_is_blocked_is_told_when_to_come_back_and_never_ends_a_robot(templa
         assert reply.status == 429
         assert not failed.is_refusal
         assert failed.retry_after_s == 60.0
-
-
-def test_an_address_above_its_limit_does_not_block_another(template: Any) -> None:
-    firewall = PlayedFirewall(rules_of_template(template))
-    limit = firewall.rules[0].limit
-    judged = [firewall.judge(SITE, "/ws", now=limit_s / limit) for limit_s in range(limit + 1)]
-
-    assert judged[:limit] == [None] * limit
-    assert judged[limit] is not None
-    assert firewall.judge("198.51.100.1", "/ws", 1.0) is None
-    assert firewall.judge(SITE, "/data/v1/maps", 1.0) is None
-    assert firewall.judge(SITE, "/ws", 62.0) is None

@@ -124,15 +124,6 @@ def production(
         yield Platform(assembly, REGION)
 
 
-def test_only_a_trial_parks_itself(assembly: Assembly) -> None:
-    rules = assembly.all("AWS::Events::Rule")
-
-    parks = any(each.get("ScheduleExpression") == "rate(1 hour)" for each in rules)
-
-    assert parks is assembly.settings.cloud.allow_insecure
-    assert bool(assembly.all("AWS::Scheduler::Schedule")) is bool(assembly.settings.scaling.schedule)
-
-
 def test_after_a_weekend_without_robots_production_has_its_servers_on_monday_at_eight(
     production: Platform,
 ) -> None:
@@ -169,15 +160,6 @@ def test_a_platform_that_its_operator_parked_is_resumed_by_its_schedule(producti
     production.hour(MONDAY)
 
     production.assert_up()
-
-
-def test_a_platform_that_is_parked_deeply_stays_so(production: Platform) -> None:
-    park(production, deep=True)
-
-    production.hour(MONDAY)
-
-    assert production.told == ["rse-pf is parked deeply"]
-    assert production.group()["MaxSize"] == 0
 
 
 def test_a_resume_by_hand_makes_up_for_the_entries_that_were_due_meanwhile(production: Platform) -> None:

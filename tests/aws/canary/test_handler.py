@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import json
-import socket
 import time
 from collections.abc import Callable
 from typing import Any
@@ -78,22 +77,6 @@ async def test_a_wrong_pose_is_a_failure() -> None:
 
 
 @in_a_loop
-async def test_a_failure_of_the_service_is_told_with_its_code() -> None:
-    async with FakePlatform() as platform:  # it has no service pnp
-        with pytest.raises(InternalError, match="server-a answered"):
-            await ask(platform)
-
-
-@in_a_loop
-async def test_a_refused_handshake_names_the_status() -> None:
-    async with FakePlatform(registry=registry()) as platform:
-        platform.refusals = [(503, 1)]
-
-        with pytest.raises(ConnectError, match="503"):
-            await ask(platform)
-
-
-@in_a_loop
 async def test_a_server_that_leaves_is_a_failure_and_not_a_wait() -> None:
     async with FakePlatform(registry=registry()) as platform:
 
@@ -139,16 +122,6 @@ async def test_a_server_that_does_not_answer_the_command_is_late(monkeypatch: py
 
         with pytest.raises(Expired, match="no answer within"):
             await ask(platform)
-
-
-def test_nobody_at_the_address_is_one_line() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        port = closed.getsockname()[1]
-
-    with pytest.raises(ConnectError, match="no server answers") as caught:
-        ask_known_pose(f"ws://127.0.0.1:{port}/ws", "t", SETTINGS, trace=TRACE, clock=time.monotonic)
-
-    assert "\n" not in caught.value.message
 
 
 @pytest.fixture

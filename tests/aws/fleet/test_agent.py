@@ -15,7 +15,7 @@ from rse_pf.audit.log import log_files, log_names, read_logs, record_once
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.agent import Agent, main
+from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
 from rse_pf.errors import RsePfError, StoreError
 from rse_pf.scaling.alarms import NAMESPACE
@@ -99,19 +99,6 @@ def test_the_emulator_accepts_the_metrics_under_the_names_of_the_alarms(tmp_path
     assert "failed" not in setup.events()
 
 
-def test_metrics_are_published_once_per_period(tmp_path: Path) -> None:
-    counting = Counting()
-    setup = AgentSetup(tmp_path, counting)
-    setup.machine.text = PAGE.format(requests=0, robots=0)
-
-    for _ in range(24):  # two minutes of steps
-        setup.agent.step()
-        setup.machine.sleep(5.0)
-
-    assert len(counting.published) == 2
-    assert {each["Namespace"] for each in counting.published} == {NAMESPACE}
-
-
 def test_without_keys_robots_are_refused_and_one_line_says_so(setup: AgentSetup) -> None:
     for _ in range(3):
         setup.agent.step()
@@ -119,18 +106,6 @@ def test_without_keys_robots_are_refused_and_one_line_says_so(setup: AgentSetup)
 
     assert setup.file.read_text() == '{"keys":[]}\n'
     assert setup.events().count("no-keys") == 1
-
-
-def test_keys_are_written_when_they_appear_and_when_they_change(setup: AgentSetup) -> None:
-    setup.agent.run("keys")
-    setup.artifacts.put("keys.json", KEYS)
-    setup.agent.run("keys")
-    first = setup.file.stat().st_ino
-    setup.agent.run("keys")
-
-    assert setup.file.read_bytes() == KEYS
-    assert setup.file.stat().st_ino == first, "written again without a change"
-    assert setup.events() == ["no-keys", "fetched"]
 
 
 def test_an_invalid_key_set_does_not_replace_the_keys(setup: AgentSetup) -> None:
@@ -141,15 +116,6 @@ def test_an_invalid_key_set_does_not_replace_the_keys(setup: AgentSetup) -> None
 
     assert setup.file.read_bytes() == KEYS
     assert ("failed", "keys") in [(event, fields.get("task")) for event, fields in setup.log]
-
-
-def test_keys_that_vanish_from_the_bucket_stay_on_the_server(setup: AgentSetup) -> None:
-    setup.artifacts.put("keys.json", KEYS)
-    setup.agent.run("keys")
-    setup.artifacts.delete("keys.json")
-    setup.agent.run("keys")
-
-    assert setup.file.read_bytes() == KEYS
 
 
 def test_a_terminating_instance_drains_once_and_publishes_nothing_more(tmp_path: Path) -> None:
@@ -179,49 +145,6 @@ def test_a_refused_hook_is_retried(setup: AgentSetup, monkeypatch: pytest.Monkey
 
     assert setup.agent.has_left
     assert len(setup.scaling.completed) == 1
-
-
-def test_a_server_that_is_down_fails_one_task_only(setup: AgentSetup) -> None:
-    setup.machine.runs = False
-    setup.artifacts.put("keys.json", KEYS)
-
-    setup.agent.step()
-
-    assert setup.file.read_bytes() == KEYS
-    assert [fields["task"] for event, fields in setup.log if event == "failed"] == ["metrics"]
-
-
-def test_a_missing_settings_file_is_two_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    place = [
-        "--bucket",
-        "b",
-        "--keys-name",
-        "k",
-        "--keys-file",
-        "k",
-        "--state",
-        "s",
-        "--group",
-        "g",
-        "--hook",
-        "h",
-    ]
-
-    assert main(["--settings", str(tmp_path / "none.json"), *place]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 2
-
-
-def test_the_deny_list_is_fetched_beside_the_keys_when_it_changes(setup: AgentSetup) -> None:
-    room = AccessControlStore(setup.artifacts)
-    setup.agent.run("access-control")
-    assert not (setup.file.parent / DENY_NAME).exists()
-
-    room.change_deny_list(lambda denied: denied.with_robot("default", "r", 1.0))
-    setup.agent.run("access-control")
-    setup.agent.run("access-control")
-
-    assert (setup.file.parent / DENY_NAME).read_bytes() == setup.artifacts.get(DENY_NAME)
-    assert setup.events() == ["fetched"]
 
 
 def test_a_full_disk_or_an_unreadable_roster_keeps_no_revocation_from_the_server(

@@ -260,9 +260,3 @@ def test_a_group_is_healthy_when_all_wanted_servers_are_healthy_everywhere(
     )
 
     assert group.is_healthy is healthy
-
-
-def test_a_group_that_lacks_a_server_is_not_healthy() -> None:
-    assert not AutoScalingGroup(
-        min_servers=2, wanted_servers=2, max_servers=2, servers=(HEALTHY,), alarms={}
-    ).is_healthy

@@ -12,14 +12,13 @@ from typing import Any
 import pytest
 
 from rse_pf.aws.account import open_account
-from rse_pf.aws.fleet.journal import UNITS, journal_command, make_batch, read_journal
+from rse_pf.aws.fleet.journal import UNITS, journal_command, make_batch
 from rse_pf.aws.fleet.server_logs import console_of, last_lines, list_logged_servers
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.aws.fleet.tasks import journals
 from rse_pf.aws.fleet.tasks.journals import JOURNAL_SHIP_S
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import StoreError
 from rse_pf.storage.object_store import MemoryStore
 
 BEGIN_US = 1_795_406_400_000_000
@@ -59,29 +58,6 @@ def context(machine: Machine, store: Any, folder: Path) -> AgentContext:
     )  # fmt: skip
 
 
-def test_each_line_has_its_time_and_its_unit() -> None:
-    batch = make_batch([
-        entry(0, "ready"), entry(1, "killed", UNIT="rse-pf-data.service", _SYSTEMD_UNIT="init.scope"),
-        entry(2, [104, 105, 255]), entry(3, ""),
-    ])  # fmt: skip
-
-    assert batch is not None
-    assert (batch.first_us, batch.cursor) == (BEGIN_US, "c3")
-    assert batch.text.decode().splitlines() == [
-        "2026-11-23T04:00:00.000Z rse-pf ready",
-        "2026-11-23T04:00:00.001Z rse-pf-data killed",
-        "2026-11-23T04:00:00.002Z rse-pf hi\ufffd",
-        "2026-11-23T04:00:00.003Z rse-pf ",
-    ]
-
-
-def test_entries_that_cannot_be_read_are_left_out_and_none_is_no_batch() -> None:
-    broken = [b"", b"{", b"[]\n", entry(1, _X=1).replace(b'"17954', b'"x'), entry(2, [999])]
-
-    assert make_batch(broken) is None
-    assert make_batch([*broken, entry(5)]).text.endswith(b"line 5\n")  # type: ignore[union-attr]
-
-
 def test_a_long_journal_becomes_several_pieces_and_no_line_is_lost_or_doubled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,27 +76,6 @@ def test_a_long_journal_becomes_several_pieces_and_no_line_is_lost_or_doubled(
         f"line {number}" for number in range(12)
     ]
     assert last_lines(store, server, 2)[0].endswith("line 10")
-
-
-def test_a_piece_that_did_not_arrive_is_sent_again(tmp_path: Path) -> None:
-    class Away(MemoryStore):
-        away = True
-
-        def put(self, name: str, data: bytes) -> None:
-            if self.away:
-                raise StoreError("away", hint="wait")
-            super().put(name, data)
-
-    machine, store = Machine(3), Away()
-    task = journals.task(context(machine, store, tmp_path))
-    with pytest.raises(StoreError):
-        task.call()
-    store.away = False
-
-    task.call()
-
-    assert machine.asked == ["", "", "c2"]
-    assert len(last_lines(store, list_logged_servers(store)[0], 100)) == 3
 
 
 def test_journals_are_shipped_in_every_phase_and_before_the_machine_ends(tmp_path: Path) -> None:
@@ -151,16 +106,6 @@ def test_journalctl_knows_the_options() -> None:
     ended = subprocess.run([*journal_command(""), "--lines=1"], capture_output=True, timeout=60)
 
     assert (ended.returncode, ended.stderr) == (0, b"")
-
-
-def test_an_entry_of_this_machine_can_be_read() -> None:
-    if shutil.which("/usr/bin/journalctl") is None:
-        pytest.skip("there is no journalctl on this machine")
-    first = next(read_journal(""), None)
-    if first is None:
-        pytest.skip("the journal of this machine has no entry of our units")
-
-    assert make_batch([first]) is not None
 
 
 @pytest.fixture

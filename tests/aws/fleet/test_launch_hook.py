@@ -6,14 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from botocore.exceptions import ClientError
 
 from rse_pf.aws.fleet.agent import Agent, AgentContext
-from rse_pf.aws.fleet.launch_hook import LaunchAction, launch_action
 from rse_pf.aws.fleet.task import Phase, Task
 from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S, BOOT_S, ready_within_s, retry_within_s
 from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context
 
@@ -81,16 +78,6 @@ def test_a_server_that_never_gets_ready_is_abandoned_within_its_budget(setup: Se
     assert setup.published == []
 
 
-def test_an_agent_that_restarts_in_service_finds_no_hook_and_goes_on(setup: Setup) -> None:
-    setup.scaling.waits = lambda hook: False
-
-    setup.steps(3)
-
-    assert setup.scaling.completed == []
-    assert len(setup.published) == 3
-    assert setup.log == [("joined", {"target": "InService", "after_s": 0.0, "hook": False})]
-
-
 def test_a_restart_beside_a_dead_server_ends_no_instance_and_does_not_stop_the_agent(setup: Setup) -> None:
     setup.scaling.waits = lambda hook: False
     setup.machine.ready = False
@@ -98,21 +85,6 @@ def test_a_restart_beside_a_dead_server_ends_no_instance_and_does_not_stop_the_a
     setup.steps(100)
 
     assert setup.context.state.phase is Phase.SERVING
-
-
-def test_a_refusal_of_aws_is_told_and_repeated(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: Any) -> None:
-        raise ClientError({"Error": {"Code": "AccessDenied"}}, "CompleteLifecycleAction")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(setup.scaling, "complete_lifecycle_action", refuse)
-        setup.steps(2)
-        with pytest.raises(ConfigurationError, match="AccessDenied"):
-            setup.agent.run("lifecycle")
-    assert [event for event, _ in setup.log] == ["failed", "failed"]
-    setup.steps(1)
-
-    assert setup.results() == [(LAUNCH, "CONTINUE")]
 
 
 @pytest.mark.parametrize("warmed", ["Warmed:Stopped", "Warmed:Running", "Warmed:Hibernated"])
@@ -148,12 +120,6 @@ def test_a_drain_begins_before_the_hook_waits_and_is_done_once(setup: Setup) -> 
     assert setup.results() == [(LAUNCH, "CONTINUE"), (DRAIN, "CONTINUE")]
     assert setup.scaling.completed[-1][0] <= hook_waits_at_s + 6.0
     assert [event for event, _ in setup.log].count("leaving") == 1
-
-
-def test_the_decision_waits_within_the_budget_only() -> None:
-    assert launch_action(is_ready=True, age_s=1e9, budget_s=1.0) is LaunchAction.CONTINUE
-    assert launch_action(is_ready=False, age_s=0.9, budget_s=1.0) is LaunchAction.WAIT
-    assert launch_action(is_ready=False, age_s=1.0, budget_s=1.0) is LaunchAction.ABANDON
 
 
 def test_retries_boot_and_readiness_fit_into_the_hook() -> None:

@@ -12,7 +12,6 @@ import pytest
 from rse_pf.aws.fleet import instance
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.metrics import read_cpu_times
-from rse_pf.errors import Disconnected
 
 STAT = "cpu  100 5 20 800 40 1 2 32 0 0\ncpu0 50 2 10 400 20 0 1 16 0 0\nintr 1\n"
 
@@ -61,27 +60,5 @@ def test_a_notice_is_found_in_the_metadata_and_its_absence_is_none(machine: Inst
     assert machine.spot_notice() == "interruption"
 
 
-@pytest.mark.system
-def test_the_server_says_how_many_robots_it_asks(machine: Instance) -> None:
-    _Pages.pages["/move?robots=16&spread_s=0.8"] = '{"robots": 5, "spread_s": 0.8, "under_way": false}'
-
-    assert machine.move(16, 0.8) == 5
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("answer", ["", "[]", "<html>", '{"robots": "many"}'])
-def test_an_answer_that_is_none_of_the_servers_is_no_traceback(machine: Instance, answer: str) -> None:
-    _Pages.pages["/move?robots=1&spread_s=0"] = answer
-
-    with pytest.raises(Disconnected):
-        machine.move(1, 0.0)
-
-
 def test_cpu_is_what_neither_idles_nor_waits_and_stolen_time_counts() -> None:
     assert read_cpu_times(STAT) == (160.0, 1000.0)
-
-
-def test_this_machine_has_such_a_page() -> None:
-    busy, there = Instance(0).cpu_times()
-
-    assert 0 < busy <= there

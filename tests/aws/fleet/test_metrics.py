@@ -39,32 +39,6 @@ def test_a_page_of_a_real_server_is_read_completely() -> None:
     assert reading.answers[10_000.0] == 3.0
 
 
-def test_counters_are_published_as_the_increase_since_the_last_sample() -> None:
-    before = ServerMetrics(requests=100, bytes_in=10, answers={1.0: 90, 2.0: 100})
-    now = ServerMetrics(requests=130, bytes_in=15, robots=4, answers={1.0: 95, 2.0: 130})
-
-    told = named(datums(before, now, "group", "i-1"))
-
-    assert told["Requests"]["Value"] == 30
-    assert told["BytesIn"]["Value"] == 5
-    assert told["Robots"]["Value"] == 4
-    assert (told["AnswerMs"]["Values"], told["AnswerMs"]["Counts"]) == ([1.0, 2.0], [5, 25])
-
-
-def test_a_restarted_server_counts_from_zero_again() -> None:
-    told = named(
-        datums(
-            ServerMetrics(requests=100, answers={1.0: 100}),
-            ServerMetrics(requests=7, answers={1.0: 7}),
-            "group",
-            "i-1",
-        )
-    )
-
-    assert told["Requests"]["Value"] == 7
-    assert told["AnswerMs"]["Counts"] == [7]
-
-
 def test_crashes_of_native_code_are_published_as_their_increase_and_only_while_there_are_any() -> None:
     before, now = (read_page(page([], worker_crashes=count)) for count in (2, 3))
 
@@ -100,10 +74,6 @@ def test_every_series_of_an_operator_alarm_that_we_publish_is_published_by_a_ser
     )
 
     assert wanted - set(told) == {STORE_ERRORS}, "another task publishes that"
-
-
-def test_without_answers_no_answer_times_are_published() -> None:
-    assert "AnswerMs" not in named(datums(ServerMetrics(), ServerMetrics(), "group", "i-1"))
 
 
 def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() -> None:

@@ -88,15 +88,6 @@ def test_the_papers_profile_spreads_them_within_four_of_its_periods(tmp_path: Pa
     assert fleet.is_even()
 
 
-def test_robots_that_cannot_move_are_asked_ever_more_rarely(tmp_path: Path) -> None:
-    fleet = FakeFleet([60, 60, 0], FAST, tmp_path, moves=False)
-
-    fleet.run(600)
-
-    asked = fleet.log.count("rebalance")
-    assert 2 <= asked <= 20, "about 60 without a pause that doubles"
-
-
 def test_nothing_moves_while_robots_still_arrive(tmp_path: Path) -> None:
     fleet = FakeFleet([10, 10, 0], FAST, tmp_path)
     for _ in range(6):
@@ -104,14 +95,6 @@ def test_nothing_moves_while_robots_still_arrive(tmp_path: Path) -> None:
         fleet.robots[0] += 10
 
     assert fleet.asked == 0
-
-
-def test_a_server_without_robots_asks_cloudwatch_nothing(tmp_path: Path) -> None:
-    fleet = FakeFleet([0, 0], FAST, tmp_path)
-
-    fleet.run(60)
-
-    assert fleet.cloudwatch.reads == 0
 
 
 def test_fast_metrics_are_of_high_resolution_and_hold_the_cpu_after_the_warm_up(tmp_path: Path) -> None:
@@ -180,13 +163,3 @@ def test_an_interruption_drains_the_server_within_five_seconds_and_a_recommendat
     assert log[0][1] - 110 <= 5
     assert len(machine.waits) == drains
     assert context.state.phase is (Phase.LEAVING if drains else Phase.SERVING)
-
-
-def test_without_spot_instances_no_notice_is_asked_for(tmp_path: Path) -> None:
-    machine = FakeMachine()
-    machine.notice = "interruption"
-    context = agent_context(machine, tmp_path, state=AgentState(phase=Phase.SERVING))
-
-    Agent(context, (spot_notice.task,)).step()
-
-    assert machine.waits == []

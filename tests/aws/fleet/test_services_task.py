@@ -31,14 +31,6 @@ class Setup:
         self.agent.attempt("services")
 
 
-def test_a_server_without_published_services_loads_the_empty_list(tmp_path: Path) -> None:
-    setup = Setup(tmp_path)
-
-    setup.attempt()
-
-    assert setup.machine.reloads == 1
-
-
 def test_an_archive_of_another_size_than_the_list_says_is_refused_before_it_is_read(tmp_path: Path) -> None:
     setup, digest = Setup(tmp_path), "ab" * 32
     entry = PublishedService(

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import pytest
 
 from rse_pf.aws.fleet import instance
-from rse_pf.aws.fleet.agent import TASKS, Agent
+from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentState, Phase
 from rse_pf.aws.fleet.tasks import store_errors
@@ -62,21 +62,6 @@ def test_only_failures_are_published_and_each_change_is_one_line() -> None:
         }
     ]  # fmt: skip
     assert setup.log == ["store-silent", "store-back"]
-
-
-def test_a_server_without_a_data_service_is_not_asked() -> None:
-    setup = Setup(data={"enabled": False})
-
-    setup.look(False)
-
-    assert setup.cloudwatch.published == []
-
-
-def test_the_agent_looks_in_a_thread_of_its_own() -> None:
-    context = Setup().agent._context
-
-    (task,) = [each for each in (make(context) for make in TASKS) if each.name == "store-errors"]
-    assert (task.in_thread, task.period_s) == (True, 10.0)
 
 
 class _Pages(BaseHTTPRequestHandler):

@@ -8,25 +8,16 @@ from typing import Any
 
 import botocore.session
 import pytest
-from botocore.exceptions import ClientError
 from botocore.validate import ParamValidator
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.upgrade import (
-    State,
-    UpgradeStep,
     find_failed_launch,
-    next_step,
-    preferences,
-    read_state,
-    state_of_refresh,
     upgrade,
-    versions_behind,
 )
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import VERSION_PARAMETER, ResourceNames
-from rse_pf.errors import ConfigurationError
 
 SETTINGS, NAMES = PlatformSettings(), ResourceNames()
 START = datetime(2026, 11, 23, 9, 0, tzinfo=timezone.utc)
@@ -324,26 +315,6 @@ def test_a_refresh_that_waits_is_followed_and_no_second_one_started() -> None:
     assert (ended.version, aws.servers, len(aws.refreshes)) == ("2", ["2", "2", "2"], 2)
 
 
-@pytest.mark.parametrize("has_earlier", [False, True])
-def test_a_refresh_that_is_not_listed_yet_counts_as_running(has_earlier: bool) -> None:
-    aws = with_an_earlier_refresh(FakeAws()) if has_earlier else FakeAws()
-    aws.unlisted = 2
-
-    ended, _ = run(aws)
-
-    assert (ended.version, ended.reason, aws.servers) == ("2", "", ["2", "2", "2"])
-
-
-def test_nothing_is_done_when_every_server_runs_the_newest_version() -> None:
-    aws = FakeAws(newest=1)
-
-    ended, told = run(aws)
-
-    assert (ended.version, ended.replaced, ended.reason) == ("1", False, "")
-    assert told == []
-    assert not {"start_instance_refresh", "update_stack"} & set(aws.calls)
-
-
 def test_a_parked_fleet_gets_the_version_without_a_refresh() -> None:
     aws = FakeAws(servers=0)
 
@@ -351,46 +322,6 @@ def test_a_parked_fleet_gets_the_version_without_a_refresh() -> None:
 
     assert (aws.group, aws.recorded, ended.reason) == ("2", "2", "")
     assert aws.refreshes == []
-
-
-def test_a_group_that_is_behind_is_told_with_both_versions() -> None:
-    aws = FakeAws()
-    assert versions_behind(aws.account(), SETTINGS) == ("1", "2")
-
-    run(aws)
-
-    assert versions_behind(aws.account(), SETTINGS) is None
-
-
-def test_one_server_of_an_older_version_is_reason_enough() -> None:
-    aws = FakeAws()
-    aws.group, aws.servers = "2", ["2", "1", "2"]
-
-    assert next_step(read_state(aws.account(), SETTINGS)) is UpgradeStep.REFRESH
-
-
-def test_a_stack_of_an_older_release_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    aws = FakeAws()
-    monkeypatch.setattr(
-        aws, "describe_stacks", lambda **_: {"Stacks": [{"StackStatus": "CREATE_COMPLETE", "Parameters": []}]}
-    )
-
-    with pytest.raises(ConfigurationError, match=VERSION_PARAMETER) as told:
-        run(aws)
-    assert "repeat rse-pf cloud upgrade" in told.value.hint
-
-
-@pytest.mark.parametrize(
-    ("status", "state"),
-    [
-        ("Pending", State.RUNNING), ("InProgress", State.RUNNING), ("Baking", State.RUNNING),
-        ("Cancelling", State.RUNNING), ("RollbackInProgress", State.ROLLING_BACK),
-        ("Successful", State.DONE), ("RollbackSuccessful", State.ROLLED_BACK),
-        ("RollbackFailed", State.FAILED), ("Failed", State.FAILED), ("Cancelled", State.FAILED),
-    ],
-)  # fmt: skip
-def test_every_status_of_aws_has_a_state(status: str, state: State) -> None:
-    assert state_of_refresh({"Status": status}) is state
 
 
 def test_a_launch_that_failed_for_want_of_capacity_does_not_take_the_release_back() -> None:
@@ -421,13 +352,6 @@ def test_only_a_launch_that_has_failed_takes_the_release_back(change: dict[str, 
     assert find_failed_launch([{**launch, **change}], START) is None
 
 
-def test_one_server_more_than_wanted_is_started_at_a_time_and_none_less_is_kept() -> None:
-    made = preferences(SETTINGS, ())
-
-    assert made["MinHealthyPercentage"] == 100
-    assert 0 < 19 * (made["MaxHealthyPercentage"] - 100) / 100 < 2
-
-
 @pytest.mark.parametrize(
     ("bad", "code", "last"), [(False, 0, "all servers run version 2"), (True, 1, "  | rse-pf")]
 )
@@ -448,21 +372,3 @@ def test_the_verb_tells_the_end_and_its_code_tells_a_release_that_was_taken_back
     assert main(["cloud", "upgrade"]) == code
 
     assert capsys.readouterr().out.splitlines()[-1].startswith(last)
-
-
-def test_a_refusal_of_aws_is_two_lines_and_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    aws = FakeAws()
-
-    def refuse(**_: Any) -> Any:
-        raise ClientError({"Error": {"Code": "AccessDenied"}}, "StartInstanceRefresh")
-
-    aws.start_instance_refresh = refuse  # type: ignore[method-assign]
-    monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: aws.account())
-
-    assert main(["cloud", "upgrade"]) == 2
-
-    first, second = capsys.readouterr().err.splitlines()
-    assert "AWS refuses autoscaling start_instance_refresh: AccessDenied" in first
-    assert second.startswith("  hint: ")

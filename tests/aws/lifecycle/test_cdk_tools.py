@@ -8,7 +8,6 @@ import pytest
 
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
 from rse_pf.config import PlatformSettings, resource_names
-from rse_pf.errors import DeploymentFailed, UsageError
 
 SETTINGS = PlatformSettings().replace(cloud={"bootstrap_qualifier": "lab1"})
 
@@ -51,30 +50,3 @@ def test_the_file_of_settings_reaches_the_synthesis(
     name, _, value = (checkout / "called").read_text().split()[-1].partition("=")
     assert settings_file({name: value}, repository) == tmp_path / "lab.json"
     assert settings_file({}, repository) == repository / "cdk.json"
-
-
-def test_a_deployment_that_fails_says_that_the_same_command_continues(checkout: Path) -> None:
-    (checkout / "code").write_text("1")
-
-    with pytest.raises(DeploymentFailed, match="deployment of RsePf-Data failed with exit code 1") as told:
-        CdkTools(checkout, SETTINGS, "1").deploy("RsePf-Data")
-
-    assert "the same command continues" in told.value.hint
-
-
-def test_outside_of_a_checkout_the_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"no scripts/cdk\.sh in") as told:
-        CdkTools(tmp_path, SETTINGS, "1").bootstrap()
-
-    assert "checkout" in told.value.hint
-
-
-@pytest.mark.parametrize(
-    ("folders", "built"), [((), False), (("servers",), False), (("servers", "lambda"), True)]
-)
-def test_packages_are_there_when_both_are(tmp_path: Path, folders: tuple[str, ...], built: bool) -> None:
-    for name in folders:
-        (tmp_path / "build" / name).mkdir(parents=True)
-        (tmp_path / "build" / name / "file").touch()
-
-    assert CdkTools(tmp_path, SETTINGS, "1").has_packages is built

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.aws.lifecycle.deployment import Deployment, GroupSize, ParkNote
-from rse_pf.aws.lifecycle.plan import Step, plan_down, plan_park, plan_resume, plan_up, size_to_restore
+from rse_pf.aws.lifecycle.plan import Step, plan_down, plan_park, plan_resume, plan_up
 from rse_pf.config.resource_names import STACKS
 from rse_pf.errors import ConfigurationError
 
@@ -39,17 +39,6 @@ def test_a_stack_that_aws_still_changes_is_waited_for() -> None:
     assert "build" not in steps
 
 
-def test_up_ends_parking() -> None:
-    assert actions(plan_up(PARKED, has_packages=True))[-4:] == ["fill", "alert", "forget", "await-healthy"]
-
-
-def test_parking_what_is_parked_does_nothing_and_deeper_goes_on() -> None:
-    assert plan_park(PARKED, deep=False) == []
-    assert actions(plan_park(PARKED, deep=True)) == [
-        "note", "destroy Observability", "destroy Serverless", "destroy Backend", "destroy Network", "sweep",
-    ]  # fmt: skip
-
-
 def test_what_does_not_stand_cannot_be_parked_and_what_is_not_parked_not_resumed() -> None:
     with pytest.raises(ConfigurationError, match="no platform to park"):
         plan_park(Deployment(stacks={"Data": "CREATE_COMPLETE"}), deep=False)
@@ -61,12 +50,6 @@ def test_the_data_goes_last_and_only_on_demand() -> None:
     assert actions(plan_down(UP, delete_data=True))[-4:] == [
         "unprotect Data", "destroy Data", "erase", "sweep",
     ]  # fmt: skip
-
-
-def test_a_group_keeps_the_size_that_a_newer_deployment_gave_it() -> None:
-    assert size_to_restore(GROUP, EMPTY) == GROUP
-    assert size_to_restore(GROUP, GroupSize(min_servers=1, wanted_servers=1, max_servers=4)) is None
-    assert size_to_restore(None, EMPTY) is None
 
 
 @pytest.mark.parametrize(

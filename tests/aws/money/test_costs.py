@@ -6,15 +6,12 @@ import msgspec
 import pytest
 
 from rse_pf.aws.money.costs import (
-    Bill,
     Load,
     bill_of,
-    lambda_alone,
-    lambda_executions,
     parked,
     servers_needed,
 )
-from rse_pf.aws.money.prices import Prices, ServerPrice, load_prices
+from rse_pf.aws.money.prices import ServerPrice, load_prices
 from rse_pf.config import PlatformSettings
 
 SETTINGS = PlatformSettings().replace(
@@ -36,16 +33,8 @@ FLOOR = 730 * (0.01 + 2 * 0.02 + 4 * 0.01 + 2 * 0.1)
 """Balancer, two addresses, two endpoints in two zones, two servers."""
 
 
-def replaced(**values: object) -> Prices:
-    return msgspec.structs.replace(PRICES, **values)
-
-
 def at(robots: int, fps: float = 10.0, hours: float = 24.0) -> Load:
     return Load(robots=robots, fps=fps, hours_per_day=hours)
-
-
-def counts(bill: Bill) -> dict[str, float]:
-    return {line.what: line.count for line in bill.lines}
 
 
 def test_a_bill_is_the_sum_of_its_lines_and_of_its_boxes_to_the_cent() -> None:
@@ -64,16 +53,6 @@ def test_the_small_profile_costs_less_than_a_hundred_a_month_and_parked_less_tha
     assert 50 < bill.total < 100
     assert 0 < parked(bill, deep=True).total < 25
     assert parked(bill, deep=True).total < parked(bill, deep=False).total < bill.total
-
-
-def test_parked_there_is_no_server_and_deep_no_load_balancer() -> None:
-    bill = bill_of(PlatformSettings(), load_prices()).sum_by_box()
-    shallow = parked(bill_of(PlatformSettings(), load_prices()), deep=False).sum_by_box()
-    deep = parked(bill_of(PlatformSettings(), load_prices()), deep=True).sum_by_box()
-
-    assert "backend servers" not in shallow
-    assert shallow["load balancer"] == bill["load balancer"] > 0
-    assert set(deep) == {"monitor", "scale modifier", "data servers"}
 
 
 @pytest.mark.parametrize(
@@ -99,45 +78,3 @@ def test_what_a_load_adds_to_the_floor(settings: PlatformSettings, load: Load, m
 def test_a_server_carries_commands_up_to_the_busy_threshold(robots: int, servers: int) -> None:
     # 2 vCPUs at 70 % do 200 commands of 7 ms a second: 20 of these robots.
     assert servers_needed(SETTINGS, PRICES, at(robots)) == servers
-
-
-def test_the_lambda_alone_pays_for_a_command_what_a_burst_pays() -> None:
-    prices = replaced(lambda_per_gb_s=1e-5, firewall_per_million=0.6)
-    commands = 1e6
-    every = Load(robots=1, fps=commands / (730 * 3600))
-    burst = Load(burst_commands_per_day=commands * 24 / 730)
-
-    of_bursts = bill_of(SETTINGS, prices, burst).sum_by_box()["Lambda"]
-
-    assert lambda_alone(prices, every) == pytest.approx(of_bursts, abs=0.02)
-
-
-@pytest.mark.parametrize(("cpu_ms", "billed_ms"), [(1.5, 2), (7.0, 7)])
-def test_the_lambda_is_billed_by_memory_and_by_the_millisecond(cpu_ms: float, billed_ms: int) -> None:
-    prices = replaced(lambda_per_million=0.0, lambda_per_gb_s=1e-5, command_cpu_ms=cpu_ms)
-
-    gb_s = 730 * 3600 * 1769 / 1024 * billed_ms / 1e3
-    assert lambda_alone(prices, at(1, fps=1.0)) == pytest.approx(gb_s * 1e-5)
-    assert lambda_executions(prices, at(1000, fps=1.0)) == pytest.approx(billed_ms)
-
-
-@pytest.mark.parametrize(
-    ("robots", "fps"),
-    [pytest.param(3000, 0.001, id="connections"), pytest.param(1, 277.777778, id="bytes")],
-)
-def test_connections_or_bytes_pay_the_balancers_units_whichever_is_more(robots: int, fps: float) -> None:
-    prices = replaced(balancer_unit_per_hour=1.0, command_bytes=1000)
-
-    assert bill_of(SETTINGS, prices, at(robots, fps)).total == pytest.approx(FLOOR + 730)
-
-
-def test_the_fast_profile_pays_for_fast_alarms_and_six_times_as_many_requests() -> None:
-    fast = SETTINGS.replace(scaling={"profile": "fast"})
-
-    # Each of two agents publishes, and while there are robots reads two metrics.
-    for settings, per_hour in ((SETTINGS, 60), (fast, 360)):
-        for load, requests in ((at(0), 1), (at(1), 3), (at(1, hours=6.0), 1.5)):
-            counted = counts(bill_of(settings, load_prices(), load))
-            assert counted["requests for metrics"] == pytest.approx(2 * requests * 730 * per_hour / 1e3)
-    assert "alarms that scale" not in counts(bill_of(fast, load_prices()))
-    assert counts(bill_of(fast, load_prices()))["alarms that scale, of 10 s"] > 0

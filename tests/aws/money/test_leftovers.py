@@ -85,10 +85,6 @@ def test_a_bucket_that_cannot_be_looked_into_is_told_and_ends_nothing(
     assert {each.kind: each.name for each in found if not each.unread} == ours
 
 
-def test_an_empty_account_has_none(region: str) -> None:
-    assert find_leftovers(open_account(region), NAMES) == []
-
-
 def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -> None:
     account = open_account(region)
     formation = account.client("cloudformation")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import date
 from pathlib import Path
 
@@ -16,16 +15,6 @@ def test_our_prices_say_when_and_where_they_held_and_who_read_them() -> None:
     prices = load_prices()
 
     assert all((prices.as_of, prices.region, prices.currency, prices.source, prices.servers))
-
-
-def test_a_file_replaces_only_what_it_names(tmp_path: Path) -> None:
-    file = tmp_path / "prices.json"
-    file.write_text(json.dumps({"region": "eu-central-1", "endpoint_per_hour": 1}), encoding="utf-8")
-
-    prices, ours = load_prices(file), load_prices()
-
-    assert (prices.region, prices.endpoint_per_hour) == ("eu-central-1", 1.0)
-    assert prices.balancer_per_hour == ours.balancer_per_hour
 
 
 @pytest.mark.parametrize(
@@ -55,11 +44,6 @@ def test_a_bad_file_is_one_line_and_a_hint(tmp_path: Path, data: bytes, problem:
     assert "endpoint_per_hour" in caught.value.hint
 
 
-def test_a_file_that_is_missing_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="cannot read"):
-        load_prices(tmp_path / "nothing.json")
-
-
 def test_prices_that_are_old_or_of_another_region_are_told_with_what_to_do() -> None:
     ours = load_prices()
     day = date.fromisoformat(ours.as_of)
@@ -73,22 +57,8 @@ def test_prices_that_are_old_or_of_another_region_are_told_with_what_to_do() -> 
         assert "prices.json" in lines[1]
 
 
-def test_a_type_of_server_is_added_to_ours(tmp_path: Path) -> None:
-    file = tmp_path / "prices.json"
-    file.write_text('{"servers": {"x.large": {"vcpus": 2, "per_hour": 1, "spot_per_hour": 1}}}')
-
-    assert load_prices(file).servers.keys() == {*load_prices().servers, "x.large"}
-
-
 def test_the_operators_file_beside_the_settings_is_used_before_ours(tmp_path: Path) -> None:
     assert operators_prices(None, tmp_path) == load_prices()
     (tmp_path / "prices.json").write_text('{"endpoint_per_hour": 9}', encoding="utf-8")
 
     assert operators_prices(None, tmp_path).endpoint_per_hour == 9
-
-
-@pytest.mark.parametrize(
-    ("kind", "vcpus"), [("c7i.large", 2), ("z1d.xlarge", 4), ("z1d.4xlarge", 16), ("z1d.medium", 2)]
-)
-def test_the_vcpus_of_an_unknown_type_follow_from_its_size(kind: str, vcpus: int) -> None:
-    assert load_prices().vcpus(kind) == vcpus

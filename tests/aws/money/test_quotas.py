@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
-
-from rse_pf.aws.account import Account, open_account
+from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.money.quotas import NOT_BOOTSTRAPPED, Check, check_account
 from rse_pf.config import PlatformSettings
@@ -108,22 +106,6 @@ def test_too_few_vcpus_for_the_largest_fleet_fail(region: str) -> None:
     assert check.what.startswith("quota 21, needed 22")
 
 
-def test_reserving_what_must_stay_unreserved_fails(region: str) -> None:
-    small = Quotas(L_1216C47A=22, L_B99A9384=119)
-
-    assert only("quota 119, needed 120", checks(region, quotas=small)).grade == "fail"
-
-
-def test_a_quota_that_nobody_tells_is_a_warning(region: str) -> None:
-    assert only("L-B99A9384 is not told", checks(region, quotas=Quotas())).grade == "warn"
-
-
-def test_a_full_region_has_no_room_for_another_vpc(region: str) -> None:
-    check = only("VPCs", checks(region, quotas=Quotas(L_F678F1CE=1)))
-
-    assert (check.grade, check.what.partition(":")[0]) == ("fail", "quota 1, needed 2")
-
-
 def test_an_instance_type_that_the_region_lacks_fails(region: str) -> None:
     found = checks(region, SETTINGS.replace(cloud={"instance_type": "x99.huge"}))
 
@@ -217,20 +199,3 @@ def test_a_check_that_may_not_be_made_warns_and_the_next_follows(region: str) ->
 
     assert [each.grade for each in found[-3:]] == ["warn"] * 3
     assert all("AccessDenied" in each.what for each in found[-3:])
-
-
-def test_an_account_that_knows_nobody_is_refused(region: str) -> None:
-    from botocore.exceptions import ClientError
-
-    from rse_pf.errors import ConfigurationError
-
-    class Stranger:
-        def get_caller_identity(self) -> None:
-            raise ClientError({"Error": {"Code": "InvalidClientTokenId"}}, "GetCallerIdentity")
-
-    with pytest.raises(ConfigurationError, match="InvalidClientTokenId"):
-        list(check_account(Account(region, lambda name, at: Stranger()), SETTINGS))
-
-
-def test_the_account_of_this_region_is_asked(region: str) -> None:
-    assert f"region {region}" in next(check_account(open_account(region), SETTINGS)).what

@@ -10,12 +10,10 @@ import pytest
 from botocore.exceptions import ClientError
 
 from rse_pf.audit.log import AuditLog, log_files, log_names, read_entries
-from rse_pf.aws.account import Account
 from rse_pf.aws.clients import MAX_TRIES, make_client
-from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit, open_audit_archive
+from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
 from rse_pf.aws.storage.s3_store import S3Store
-from rse_pf.config.resource_names import ResourceNames
-from rse_pf.errors import ConfigurationError, StoreError
+from rse_pf.errors import StoreError
 from rse_pf.storage.object_store import MemoryStore, ObjectStore
 
 INSTANCE = "i-0123456789abcdef0"
@@ -120,29 +118,6 @@ def test_after_lost_marks_all_is_uploaded_again_and_each_entry_is_read_once(
     assert setup.fetched(tmp_path / "fetched") == {INSTANCE: list(range(10 + more))}
 
 
-def test_the_logs_of_two_writers_on_two_machines_stay_apart(setup: ShipperSetup, tmp_path: Path) -> None:
-    setup.write(2)
-    setup.write(1, who="data")
-    setup.ship()
-    other = ShipperSetup(tmp_path / "other", setup.bucket, "i-2")
-    other.write(1, who="data")
-    other.ship()
-
-    assert setup.fetched(tmp_path / "fetched") == {INSTANCE: [0, 1], f"{INSTANCE}_data": [2], "i-2_data": [0]}
-
-
-def test_an_incomplete_line_is_uploaded_when_it_is_complete(setup: ShipperSetup, tmp_path: Path) -> None:
-    setup.write(1)
-    current = setup.folder / f"{INSTANCE}.jsonl"
-    whole = current.read_bytes()
-    current.write_bytes(whole[:-10])
-    assert setup.ship() == 0
-    current.write_bytes(whole)
-
-    assert setup.ship() == 1
-    assert setup.fetched(tmp_path / "fetched") == {INSTANCE: [0]}
-
-
 def test_the_pieces_of_version_0_1_are_read(setup: ShipperSetup, tmp_path: Path) -> None:
     line = b'{"action":"x","actor":"i-1","detail":{},"hash":"9a","seq":1,"subject":"7","time":1}\n'
     setup.bucket.put(f"audit/i-1/i-1.000000000001.{'a' * 32}.jsonl", line)
@@ -210,17 +185,3 @@ def test_a_piece_that_s3_answered_with_409_is_not_lost(locked: Any, tmp_path: Pa
             setup.ship()
 
     assert setup.fetched(tmp_path / "fetched") == {INSTANCE: list(range(8))}
-
-
-def test_a_deployment_without_the_bucket_says_to_deploy() -> None:
-    class NoLogs:
-        def can_paginate(self, method: str) -> bool:
-            return False
-
-        def list_stack_resources(self, **_: str) -> dict[str, Any]:
-            row = {"LogicalResourceId": "Artifacts1", "ResourceType": "AWS::S3::Bucket"}
-            return {"StackResourceSummaries": [row]}
-
-    with pytest.raises(ConfigurationError) as told:
-        open_audit_archive(Account("r", lambda service, region: NoLogs()), ResourceNames())
-    assert "rse-pf cloud up" in told.value.hint

@@ -11,7 +11,7 @@ from botocore.exceptions import ClientError, ConnectTimeoutError
 
 from rse_pf.aws.clients import MAX_S, MAX_TRIES, make_client, with_retries
 from rse_pf.aws.storage import S3Store, open_bucket
-from rse_pf.errors import Archived, Conflict, NotFound, StoreError
+from rse_pf.errors import Archived, Conflict, StoreError
 
 
 @pytest.fixture
@@ -85,13 +85,6 @@ def test_only_temporary_errors_are_retried(code: str, status: int, tries: int) -
     assert clock.tries == tries
 
 
-def test_clients_do_not_retry_themselves(region: str) -> None:
-    config = make_client("s3", region).meta.config
-
-    assert config.retries["total_max_attempts"] == 1
-    assert config.connect_timeout + config.read_timeout < MAX_S / 2
-
-
 class Lossy:
     """A bucket's client that loses the answer to the first write, after S3 has done it."""
 
@@ -157,13 +150,6 @@ def test_a_409_of_s3_is_retried_because_nothing_was_stored(store: S3Store, regio
     assert store.get("head") == b"mine"
 
 
-def test_a_409_that_does_not_end_is_an_error_and_no_conflict(store: S3Store, region: str) -> None:
-    with pytest.raises(StoreError, match="ConditionalRequestConflict") as told:
-        S3Store(Undecided(make_client("s3", region), 9), "maps").compare_and_swap("head", None, b"mine")
-
-    assert not isinstance(told.value, Conflict)
-
-
 def test_after_a_409_the_object_that_is_there_decides(store: S3Store, region: str) -> None:
     undecided = S3Store(Undecided(make_client("s3", region), times=1), "maps")
     store.put("head", b"theirs")
@@ -208,20 +194,6 @@ def test_a_presigned_url_fixes_name_length_and_digest(store: S3Store) -> None:
     assert query["X-Amz-Algorithm"] == ["AWS4-HMAC-SHA256"]
     assert query["X-Amz-Expires"] == ["60"]
     assert urllib.parse.urlsplit(url).path.endswith("/maps/a")
-
-
-def test_names_of_presigned_urls_are_checked(store: S3Store) -> None:
-    with pytest.raises(StoreError, match="is not a name"):
-        store.presigned_put("../x", size=1, sha256="00" * 32, ttl_s=60)
-    with pytest.raises(StoreError, match="is not a name"):
-        store.presigned_get("../x", ttl_s=60)
-
-
-def test_a_missing_bucket_is_a_store_error(region: str) -> None:
-    with pytest.raises(StoreError, match="bucket does not exist") as told:
-        open_bucket("nowhere", region).get("a")
-
-    assert not isinstance(told.value, NotFound)
 
 
 @pytest.mark.parametrize(

@@ -75,13 +75,6 @@ def test_a_second_enrolment_names_the_command_that_keeps_what_was_stored(
     assert "1 object more" in run(capsys, *command)
 
 
-def test_a_platform_that_stored_nothing_says_so(capsys: Capture, platform: Path) -> None:
-    enrol(capsys)
-
-    assert main(["robot", "adopt", "robot-1"]) == 2
-    assert "the platform 'default' of this machine has stored nothing yet" in capsys.readouterr().err
-
-
 def test_what_was_stored_without_a_key_is_adopted(capsys: Capture, platform: Path) -> None:
     store, robot = DirectoryStore(platform / "objects"), enrol(capsys)
     store.put(object_name(OLD, digest_of(DATA)), DATA)
@@ -108,17 +101,6 @@ def test_a_newer_snapshot_stays_and_the_older_one_is_not_removed(capsys: Capture
     assert store.get(state_name(OLD, "counter")) == b"7"
 
 
-def test_a_robot_without_another_identity_adopts_nothing() -> None:
-    store = MemoryStore()
-    name = stored_for(store, OLD)
-
-    adopted = adopt(store, OLD, source=OLD)
-
-    assert (adopted.objects, adopted.snapshots) == (0, 0)
-    assert store.get(name) == DATA
-    assert store.get(state_name(OLD, "counter")) == b"7"
-
-
 def test_an_interrupted_adoption_is_continued() -> None:
     store, robot = MemoryStore(), OLD._replace(enrolment="k" * 43)
     stored_for(store, OLD)
@@ -131,27 +113,12 @@ def test_an_interrupted_adoption_is_continued() -> None:
     assert all(robot.folder in info.name for info in store.list())
 
 
-def test_another_tenants_robot_of_the_same_name_keeps_its_own() -> None:
-    store, other = MemoryStore(), OLD._replace(tenant="rival")
-    mine = stored_for(store, other)
-
-    adopt(store, OLD._replace(enrolment="k" * 43), source=OLD)
-
-    assert store.get(mine) == DATA
-
-
 @pytest.mark.parametrize("key", ["robot-1", "robot:short", "../x"])
 def test_a_key_that_is_none_is_refused(capsys: Capture, platform: Path, key: str) -> None:
     (platform / "objects").mkdir()
 
     assert main(["robot", "adopt", "robot-1", "--from-key", key]) == 2
     assert "hint" in capsys.readouterr().err
-
-
-def test_adoption_needs_the_store(capsys: Capture, platform: Path) -> None:
-    assert main(["robot", "adopt", "robot-1", "--not-enrolled"]) == 2
-    assert "--store" in capsys.readouterr().err
-    assert main(["robot", "list", "--from-key", "x"]) == 2
 
 
 def test_a_new_key_under_an_old_name_reads_and_counts_nothing_of_the_old_one(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -49,25 +48,6 @@ def test_show_cannot_be_made_to_write_control_characters(folder: Path, capsys: C
     assert out.count("\n") == 1
     assert "\x1b" not in out
     assert r'reason="a reason\n\u001b[2J"' in out
-
-
-def test_show_prints_an_entry_whose_time_is_no_date(tmp_path: Path, capsys: Capture):
-    entry = {"time": 1e300, "actor": "operator", "action": "robot.disabled", "subject": "", "detail": {}}
-    (tmp_path / "operator.jsonl").write_text(json.dumps(entry) + "\n")
-
-    assert main(["audit", "show", str(tmp_path)]) == 0
-    assert "1e+300" in capsys.readouterr().out
-
-
-def test_show_as_json_by_action_and_by_file(folder: Path, capsys: Capture):
-    files = [str(path) for path in folder.iterdir()]
-    assert main(["audit", "show", *files, "--only", "disabled", "--json"]) == 0
-
-    (line,) = capsys.readouterr().out.splitlines()
-    assert json.loads(line) == {
-        "log": "operator", "time": 1e9 + 1, "actor": "operator", "action": "robot.disabled",
-        "subject": "robot-1", "detail": {"reason": "a reason\n\x1b[2J"},
-    }  # fmt: skip
 
 
 def test_show_prints_all_servers_of_a_cloud_and_keeps_the_files(cloud: Any, tmp_path: Path, capsys: Capture):

@@ -16,7 +16,7 @@ import pytest
 import websockets
 
 from rse_pf.auth.robot_key import RobotKey
-from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore, TrustStore
+from rse_pf.auth.trust_store import AccessControlStore, TrustStore
 from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
@@ -102,17 +102,6 @@ def test_robots_of_a_cloud_are_enrolled_listed_disabled_enabled_and_removed(
     assert [each.robot for each in room.roster().robots] == ["robot-1"]
     assert main(["robot", "remove", "robot-2", "--cloud"]) == 2
     assert "is not enrolled" in capsys.readouterr().err
-
-
-def test_nothing_private_reaches_the_bucket(capsys: Capture, cloud: Any) -> None:
-    output_of(capsys, "token", "init", "--cloud")
-    enrol(capsys, "robot-1")
-    secret = json.loads(Path("robot-1.key").read_text())["d"]
-
-    for name in ("keys.json", ROBOTS_NAME, DENY_NAME):
-        text = cloud.get_object(Bucket="artifacts", Key=name)["Body"].read().decode()
-        assert secret not in text
-        assert '"d"' not in text
 
 
 def test_concurrent_changes_of_two_operators_are_both_kept(

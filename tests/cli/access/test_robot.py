@@ -6,7 +6,6 @@ import asyncio
 import base64
 import io
 import json
-import re
 import stat
 import time
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.auth.robot_key import RobotKey
-from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
+from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.main import main
 from rse_pf.config import AuthSettings
@@ -123,13 +122,6 @@ def test_a_disabled_robot_is_refused_whoever_signed_and_an_enabled_one_needs_a_f
     assert json.loads(said(capsys, "robot", "list", "--json"))[0]["state"] == "enrolled"
 
 
-def test_a_robot_without_a_key_of_its_own_can_be_disabled_too(capsys: Capture, platform: Path) -> None:
-    said(capsys, "robot", "disable", "other", "--not-enrolled")
-
-    assert "default  other  disabled  no key of its own" in said(capsys, "robot", "list")
-    assert problem(platform, issued(capsys, "other")) == "disabled"
-
-
 def test_one_token_is_revoked_and_the_next_one_is_good(
     capsys: Capture, platform: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,24 +135,6 @@ def test_one_token_is_revoked_and_the_next_one_is_good(
     assert (problem(platform, first), problem(platform, second)) == ("revoked", "")
     assert main(["token", "inspect", first]) == 1
     assert "no: revoked" in capsys.readouterr().out
-
-
-def test_a_token_that_a_robot_signed_is_revoked_in_the_tenant_of_the_roster(
-    capsys: Capture, platform: Path
-) -> None:
-    token = asyncio.run(enrolled(capsys, "robot-1", "--tenant", "lab").token())
-
-    said(capsys, "token", "revoke", token)
-
-    assert problem(platform, token) == "revoked"
-
-
-def test_all_tokens_of_a_robot_until_now_are_revoked(capsys: Capture, platform: Path) -> None:
-    mine, others = issued(capsys), issued(capsys, "robot-2")
-
-    said(capsys, "token", "revoke", "--all-of", "robot-1", "--not-enrolled")
-
-    assert (problem(platform, mine), problem(platform, others)) == ("issued-too-early", "")
 
 
 def test_a_token_is_issued_for_an_enrolled_robot_of_another_tenant_only_with_its_tenant(
@@ -224,17 +198,6 @@ def _claims(robot: str) -> Claims:
     return Claims(robot=RobotId("default", robot), token_id="t", issued_s=1.0, expires_s=2.0, key_id="k")
 
 
-def test_the_next_command_that_is_named_is_for_the_same_platform(capsys: Capture, platform: Path) -> None:
-    platform.rename(platform.with_name("lab"))
-    lab = ("--not-enrolled", "--name", "lab")
-
-    disabled = said(capsys, "robot", "disable", "robot-1", *lab)
-    next_one = disabled.partition("to let it in again:  rse-pf ")[2].split()
-    assert "enabled again" in said(capsys, *next_one)
-    revoked = said(capsys, "token", "revoke", "--all-of", "robot-1", *lab)
-    assert "is disabled" in said(capsys, *revoked.partition("to keep the robot out:  rse-pf ")[2].split())
-
-
 def test_a_disabled_robot_of_another_tenant_is_enabled_only_with_its_tenant(
     capsys: Capture, platform: Path
 ) -> None:
@@ -244,38 +207,6 @@ def test_a_disabled_robot_of_another_tenant_is_enabled_only_with_its_tenant(
     assert "is of tenant 'acme', and not of 'default'" in refused(capsys, "robot", "enable", "robot-1")[0]
 
     assert "of tenant 'acme'" in said(capsys, "robot", "enable", "robot-1", "--tenant", "acme")
-
-
-def test_a_revocation_says_whose_tokens_are_refused_and_since_when(capsys: Capture, platform: Path) -> None:
-    enrolled(capsys, "robot-1", "--tenant", "acme")
-
-    first, second = said(capsys, "token", "revoke", "--all-of", "robot-1", "--tenant", "acme").splitlines()
-
-    assert re.search(
-        r"'robot-1' of tenant 'acme' from before 20\d\d-\d\d-\d\d \d\d:\d\d:\d\dZ are refused", first
-    )
-    assert "rse-pf robot disable robot-1 --tenant acme" in second
-
-
-def test_a_token_of_another_platform_is_not_revoked(capsys: Capture, platform: Path) -> None:
-    signer = SigningKey.from_seed(b"t" * 32, "another")
-    token = signer.issue("robot-1", now=time.time(), token_id="t", settings=SETTINGS)
-
-    assert "the key 'another' is not known" in refused(capsys, "token", "revoke", token)[0]
-
-
-def test_the_list_has_the_robots_of_all_tenants_or_of_one(capsys: Capture, platform: Path) -> None:
-    enrolled(capsys, "robot-1", "--tenant", "acme")
-    enrolled(capsys, "robot-2")
-    said(capsys, "robot", "disable", "robot-3", "--tenant", "beta", "--not-enrolled")
-
-    listed = [line.split("  ")[:3] for line in said(capsys, "robot", "list").splitlines()]
-    assert listed == [
-        ["acme", "robot-1", "enrolled"], ["beta", "robot-3", "disabled"], ["default", "robot-2", "enrolled"],
-    ]  # fmt: skip
-    rows = json.loads(said(capsys, "robot", "list", "--json", "--tenant", "acme"))
-    assert [(row["tenant"], row["robot"]) for row in rows] == [("acme", "robot-1")]
-    assert "in tenant 'acmee'" in said(capsys, "robot", "list", "--tenant", "acmee")
 
 
 def test_after_a_rotation_both_keys_are_trusted_and_after_two_the_first_is_not(
@@ -297,10 +228,6 @@ def test_a_token_is_issued_with_scopes_and_tenant(capsys: Capture, platform: Pat
     claims = json.loads(said(capsys, "token", "inspect", token))["claims"]
 
     assert (claims["scope"], claims["tenant"]) == ("services:pnp", "lab")
-
-
-def test_a_roster_that_is_empty_says_so(capsys: Capture, platform: Path) -> None:
-    assert "no robot is enrolled" in said(capsys, "robot", "list")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 
 from rse_pf.aws.storage import S3Store
 from rse_pf.cli.main import main
-from rse_pf.local.state import settings_file
 from rse_pf.storage.object_store import DirectoryStore, ObjectStore, digest_of
 from tests.kit.fake_data_service import Service, small_settings
 
@@ -67,16 +66,6 @@ def test_the_list_has_every_tenant_with_robots_or_data(capsys: Capture, store: D
     ]
 
 
-def test_the_list_has_the_quota_that_the_platform_was_started_with(
-    capsys: Capture, platform: Path, store: DirectoryStore
-) -> None:
-    store.put("objects/acme/r/1", b"x")
-    chosen = {"context": {"rse-pf": {"data": {"tenant_quota_bytes": 5_000_000}}}}
-    settings_file(platform).write_text(json.dumps(chosen))
-
-    assert listed(capsys)["acme"]["quota_bytes"] == 5_000_000
-
-
 def check_quotas_at_once(capsys: Capture, store: ObjectStore, options: str = "") -> None:
     """Lower, raise and remove the quota of a tenant while a data service runs."""
     settings = small_settings(quota_bytes=1 << 30, tenant_quota_bytes=60_000, part_bytes=MIB)
@@ -108,19 +97,6 @@ def test_a_quota_of_one_tenant_of_a_cloud_holds_at_once(capsys: Capture, cloud: 
     capsys.readouterr()
 
     check_quotas_at_once(capsys, S3Store(cloud, "maps"), "--cloud")
-
-
-def test_a_robot_keeps_its_key_when_its_quota_changes(capsys: Capture, store: DirectoryStore) -> None:
-    enrol(capsys, "robot-1", "acme")
-    before = json.loads(output_of(capsys, "robot list --json"))[0]
-
-    said = output_of(capsys, "robot quota robot-1 --tenant acme --quota data_bytes=5000")
-
-    assert "'robot-1' of tenant 'acme' may store 5000 bytes" in said
-    after = json.loads(output_of(capsys, "robot list --json"))[0]
-    assert after == {**before, "quotas": {"data_bytes": 5000.0}}
-    output_of(capsys, "robot quota robot-1 --tenant acme --quota data_bytes=default")
-    assert json.loads(output_of(capsys, "robot list --json"))[0] == before
 
 
 @pytest.mark.parametrize(

@@ -156,20 +156,3 @@ def test_a_version_of_a_map_is_exported_as_mcap(folder: Path) -> None:
 
     with open_bag_file(Path("h.mcap")) as bag:
         assert {topic.name for topic in bag.topics} == {"/a/pose", "/a/path", "/tf", "/map"}
-
-
-def test_a_wrong_call_gets_one_line_and_a_hint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "empty").mkdir()
-    for words, says in (
-        (["from-bag", "none.bag"], "there is no bag none.bag"),
-        (["from-bag", "drive.bag", "--depth-scale", "0"], "depth_scale = 0 is not above 0"),
-        (["from-bag", "drive.bag", "--scale", "marker:100"], "has depth, so that its scale is known"),
-        (["from-bag", "drive.bag", "--colour", "/x"], "the bag has no topic /x; its topics: /cam"),
-        (["to-bag", "empty", "--out", "m.mcap"], "empty holds no trajectory.txt"),
-        (["to-bag", "empty", "--out", "m.bag", "--format", "mcap"], "does not end like a bag of mcap"),
-    ):
-        assert main(["map", *words]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert says in lines[0]
-        assert len(lines) == 2
-        assert lines[1].startswith("  hint: ")

@@ -16,14 +16,12 @@ import pytest
 
 import client_sdk
 from client_sdk.commands.answer_types import PoseAnswer
-from client_sdk.frontend import TrackedFrame
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.point_map import read_ply
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.cli.main import main
 from rse_pf.cli.maps import from_camera
-from rse_pf.cli.maps.frame_table import FrameTable
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.storage.quotas import set_own_quota
@@ -126,20 +124,6 @@ def test_a_recording_with_true_poses_tells_the_error_of_the_path(
     assert f"error beside the ground truth: ATE {report['ate_cm']:.2f} cm" in out
 
 
-def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth = Trajectory(np.arange(6) * 0.1, np.tile(np.eye(4), (6, 1, 1)))
-    write_tum(folder / "drive", [frame_at(row, depth=True) for row in range(6)], truth)
-    cv2.imwrite("drive/rgb/004.png", np.zeros((24, 32, 3), np.uint8))
-
-    code = main(["map", "from-camera", "drive", *PLATFORM, "--out", "out"])
-
-    shown = capsys.readouterr()
-    assert code == 1
-    assert "finding ended-early: the source failed after 4 frames, which are kept" in shown.out
-    assert "is 32x24 px, the camera of the recording 320x240 px" in shown.err
-    assert len(read_trajectory(folder / "out/trajectory.txt")) == 4
-
-
 def test_a_map_above_the_quota_of_its_tenant_is_not_kept_and_the_drive_is(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,21 +137,6 @@ def test_a_map_above_the_quota_of_its_tenant_is_not_kept_and_the_drive_is(
     assert "no map is kept: quota: the tenant 'acme' stores 0 bytes" in capsys.readouterr().out
     assert not list(Path("objects").glob("maps/acme/*"))
     assert len(read_ply(Path("out-camera/map.ply"))[0]) > 100
-
-
-def test_a_finding_about_the_source_is_shown_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    frames = [frame_at(row, depth=True) for row in range(6)]
-    write_tum(folder / "drive", frames, Trajectory(np.arange(6) + 50.0, np.tile(np.eye(4), (6, 1, 1))))
-    (folder / "drive/rgb/003.png").write_bytes(b"")
-
-    main(["map", "from-camera", "drive", *PLATFORM])
-
-    shown = capsys.readouterr()
-    assert shown.err.count("finding reference-times: ") == 1
-    assert "finding reference-times: " not in shown.out
-    assert shown.out.count("finding left-out: 1 image left out, damaged or empty: 003.png") == 1
-    report = json.loads(Path("out-camera/report.json").read_text())
-    assert [each["name"] for each in report["check"]["source"]] == ["reference-times", "left-out"]
 
 
 RNG = np.random.default_rng(3)
@@ -197,55 +166,6 @@ def test_the_hint_of_a_lost_drive_names_what_its_images_show(
     assert hint in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_path_without_scale_has_no_error_in_centimetres(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    poses = np.tile(np.eye(4), (9, 1, 1))
-    poses[:, 0, 3] = STEP_M * np.arange(9)
-    frames = [frame_at(row, depth=True) for row in range(9)]
-    write_tum(folder / "drive", frames, Trajectory(np.array([f.timestamp_s for f in frames]), poses))
-
-    code = main(["map", "from-camera", "drive", "--no-depth", *PLATFORM])
-
-    out = capsys.readouterr().out
-    report = json.loads(Path("out-camera/report.json").read_text())
-    assert code == 0, out
-    assert report["unit"] != "m"
-    assert [report[name] for name in ("path_m", "ate_cm", "rpe_cm")] == [None, None, None]
-    assert "error beside" not in out
-
-
-def test_several_addresses_are_given_to_the_robot_which_takes_the_nearest(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["v.avi", "--intrinsics", "i.json", "--frames", "7", "--url", "ws://q/ws", *PLATFORM]
-
-    assert main(["map", "from-camera", *words]) == 0, capsys.readouterr().out
-
-    assert Path("addresses").read_text() == "ws://q/ws ws://p/ws"
-
-
-def test_a_stereo_drive_that_was_moved_when_it_was_saved_says_so() -> None:
-    (line,) = from_camera.offset_lines(
-        {"disparity_offset_px": -0.193, "disparity_offset_deviation_px": 0.027}
-    )
-
-    assert "lacks -0.19 +- 0.03 px" in line
-    assert from_camera.offset_lines({"disparity_offset_px": 0.0}) == from_camera.offset_lines({}) == []
-
-
-def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["map", "from-camera", "v.avi", "--intrinsics", "i.json", "--frames", "7", *PLATFORM])
-
-    out = capsys.readouterr().out
-    assert code == 0
-    assert "units; scale: up to scale" in out
-    assert json.loads(Path("out-camera/report.json").read_text())["scale"] == "up to scale"
-    assert "metres" not in Path("out-camera/trajectory.txt").read_text()
-    assert b"comment up to scale" in Path("out-camera/map.ply").read_bytes()[:200]
-    assert len(read_ply(Path("out-camera/map.ply"))[0]) > 100
-
-
 def test_each_frame_has_a_row_that_says_why_it_has_no_pose(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -266,26 +186,6 @@ def test_each_frame_has_a_row_that_says_why_it_has_no_pose(
     assert f"lost: frame 8; because: {rows[7]['reason']}" in capsys.readouterr().out
 
 
-def test_many_lost_frames_are_named_in_short() -> None:
-    table, lost, good = FrameTable(), tracked("few matches", None), tracked("", np.eye(4))
-    weak = tracked("clustered", np.eye(4))
-    for done in (good, lost, lost, good, lost, *([good, weak] * 9)):
-        table.add(done)
-
-    assert list(table.lines()) == [
-        "lost: frames 2-3, 5; because: few matches",
-        "weak poses: frames 7, 9, 11, 13, 15, 17, 19, 21, ...; frames.csv says why",
-    ]
-
-
-def tracked(reason: str, pose: Any) -> TrackedFrame:
-    status = "lost" if pose is None else "tracked"
-    return TrackedFrame(
-        frame=frame_at(0, depth=True), T_world_camera=pose, keyframe=False, inliers=9, matches=9,
-        status=status, reason=reason,
-    )  # fmt: skip
-
-
 def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -300,20 +200,6 @@ def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
     assert lines[0].startswith("frame 1: first, ")
-
-
-def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    writer = cv2.VideoWriter("still.avi", cv2.VideoWriter_fourcc(*"FFV1"), 10.0, (320, 240))
-    for _ in range(3):
-        writer.write(frame_at(0, depth=False).rgb)
-    writer.release()
-
-    code = main(["map", "from-camera", "still.avi", "--intrinsics", "i.json", *PLATFORM])
-
-    error = capsys.readouterr().err
-    assert code == 1
-    assert "3 of 3 frames have no pose in the map" in error
-    assert "must move, not only turn" in error
 
 
 @pytest.mark.parametrize(

@@ -52,33 +52,6 @@ def asked(capsys: pytest.CaptureFixture[str], store: Path, *words: str) -> objec
     return json.loads(capsys.readouterr().out)
 
 
-def test_list_names_each_map_with_its_head(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(store, "list") == 0
-
-    assert "hall" in (said := capsys.readouterr().out)
-    assert "3 keyframes" in said
-    (only,) = asked(capsys, store, "list")  # type: ignore[misc]
-    assert (only["name"], only["number"], only["note"]) == ("hall", 2, "second")
-
-
-def test_show_describes_a_version_and_draws_it(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(store, "show", "hall", "--png", str(store.parent / "hall.png")) == 0
-
-    assert "keyframes   3  (robot-1 3)" in capsys.readouterr().out
-    assert (store.parent / "hall.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_diff_rollback_and_show_all_agree(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    versions = asked(capsys, store, "show", "hall", "--all")
-    first, second = (each["id"] for each in versions)  # type: ignore[attr-defined]
-    assert asked(capsys, store, "diff", "hall", first[:8])["added"] == [2]  # type: ignore[index]
-
-    assert asked(capsys, store, "rollback", "hall", first[:8]) == {"was": second, "head": first}
-
-    again = asked(capsys, store, "show", "hall", "--all")
-    assert [each["head"] for each in again] == [True, False]  # type: ignore[attr-defined]
-
-
 def test_prune_removes_old_versions_and_says_how_many_bytes_are_free(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,9 +9,7 @@ import pytest
 
 from rse_pf.cli.main import main
 from rse_pf.cli.services import building
-from rse_pf.services.custom.dependencies import Dependencies, LockedRequirement, tree_digest
-
-HASH = "--hash=sha256:" + "a" * 64
+from rse_pf.services.custom.dependencies import Dependencies, tree_digest
 
 
 @pytest.fixture(autouse=True)
@@ -57,32 +55,6 @@ def test_an_unlocked_requirement_is_refused_by_every_action_that_builds(
         told = complaint(capsys, action, "mine")
         assert "requirements.txt, line 1: 'tabulate>=0.9' is not locked" in told
         assert "rse-pf service lock" in told
-
-
-def test_packages_are_for_services_in_python(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["service", "new", "mine", "--lang", "lua"])
-    Path("mine/requirements.txt").write_text(f"greeting==1.2 {HASH}\n")
-
-    assert "is for services in Python, mine is in lua" in complaint(capsys, "build", "mine")
-    assert "is for services in Python" in complaint(capsys, "lock", "mine")
-
-
-def test_a_service_without_a_wish_has_nothing_to_lock(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["service", "new", "mine"])
-
-    told = complaint(capsys, "lock", "mine")
-    assert "there is no mine/requirements.in" in told
-    assert "one on each line" in told
-
-
-def test_lock_says_what_it_chose(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    main(["service", "new", "mine"])
-    chosen = [LockedRequirement(name="greeting", version="1.2", line="")]
-    monkeypatch.setattr(building, "lock_dependencies", lambda _: chosen)
-    capsys.readouterr()
-
-    assert main(["service", "lock", "mine"]) == 0
-    assert capsys.readouterr().out.splitlines()[0] == "greeting==1.2"
 
 
 def test_build_says_what_a_service_runs_with(

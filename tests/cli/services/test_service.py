@@ -38,18 +38,6 @@ def test_new_writes_a_folder_that_is_a_service_with_a_recorded_request(language:
     assert "@NAME@" not in "".join(p.read_text() for p in Path("mine").rglob("*") if p.is_file())
 
 
-def test_new_never_writes_over_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("mine").mkdir()
-
-    assert "exists already" in complaint(capsys, "new", "mine")
-    assert list(Path("mine").iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["../up", "Mine", "", "a b", "x" * 41])
-def test_a_name_that_could_be_a_path_is_refused(capsys: pytest.CaptureFixture[str], name: str) -> None:
-    assert "not a valid service name" in complaint(capsys, "new", name)
-
-
 def test_an_installed_service_is_listed_and_refused_after_a_change(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -65,25 +53,6 @@ def test_an_installed_service_is_listed_and_refused_after_a_change(
     assert "was changed after it was installed" in complaint(capsys, "list", "--services", "all")
     assert main(["local", "--services", "all", "--port", "0"]) != 0
     assert "was changed after it was installed" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("request_text", ["{points", "[" * 100_000], ids=["no JSON", "deep"])
-def test_a_request_that_is_not_json_says_where(capsys: pytest.CaptureFixture[str], request_text: str) -> None:
-    assert "--request is not JSON" in complaint(capsys, "call", "mine", "--request", request_text)
-
-
-def test_a_recorded_request_that_is_not_json_names_its_file(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["service", "new", "mine"])
-    Path("mine/requests/bad.json").write_text("{")
-
-    assert "bad.json is not JSON" in complaint(capsys, "test", "mine")
-
-
-def test_a_folder_that_is_not_a_service_is_refused_with_how_to_make_one(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    told = complaint(capsys, "test", "nothing-here")
-    assert "rse-pf service new NAME" in told
 
 
 def test_a_missing_cmake_is_named(

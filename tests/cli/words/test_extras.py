@@ -3,48 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from rse_pf.cli.main import VERBS, main
+from rse_pf.cli.main import main
 from rse_pf.command_line import extras
-from rse_pf.command_line.extras import EXTRAS, VERBS_NEED, extra_of_module, modules_of, require
+from rse_pf.command_line.extras import require
 from rse_pf.errors import MissingExtra
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     tomllib = pytest.importorskip("tomli", reason="Python 3.10 reads no TOML")
-
-
-@pytest.fixture
-def declared(repository: Path) -> dict[str, Any]:
-    project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return {**project["optional-dependencies"], "base": project["dependencies"]}
-
-
-def package_of(requirement: str) -> str:
-    return re.split(r"[\[<>=; ]", requirement)[0]
-
-
-def test_every_extra_is_known_with_packages_that_it_installs(declared: dict[str, Any]) -> None:
-    assert set(EXTRAS) == set(declared)
-    for name, extra in EXTRAS.items():
-        packages = {package_of(each) for each in declared[name]}
-        assert packages - {"rse-pf"} == set(extra.modules.values()), name
-
-
-def test_every_verb_says_what_it_needs() -> None:
-    assert {verb.split()[0] for verb in VERBS_NEED} == set(VERBS)
-    assert {extra for needed in VERBS_NEED.values() for extra in needed} <= set(EXTRAS)
-
-
-def test_an_extra_has_the_modules_of_those_that_it_includes() -> None:
-    assert {"rich", "uvicorn", "picows", "jwt"} <= modules_of("local").keys()
 
 
 def test_a_missing_package_is_named_before_any_work(
@@ -93,14 +65,3 @@ def test_a_module_that_cannot_be_imported_is_reported_as_its_extra(
 
     assert main(["settings"]) == 2
     assert "pip install 'rse-pf[local]'" in capsys.readouterr().err
-
-
-def test_a_module_of_no_extra_is_a_defect_and_stays_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lack(*_: object) -> None:
-        raise ModuleNotFoundError("No module named 'rse_pf.nothing'", name="rse_pf.nothing")
-
-    monkeypatch.setattr("rse_pf.cli.settings.setting_rows", lack)
-
-    assert extra_of_module("rse_pf.nothing") is None
-    with pytest.raises(ModuleNotFoundError):
-        main(["settings"])

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 
 import pytest
 
 from client_sdk.frontend import FrontEndOptions
-from client_sdk.mapper import Mapper
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.compare.configurations import BUILT_IN, SLOTS, configurations_of
+from rse_pf.extensions.experiments.compare.configurations import BUILT_IN, configurations_of
 
 toml = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
 
@@ -60,15 +58,6 @@ def test_a_python_file_sets_options_and_may_import_its_neighbour(tmp_path: Path)
     assert (found.name, found.frontend.features, found.slots) == ("mine", 321, {})
 
 
-def test_functions_of_a_file_become_slots_that_the_mapper_takes(tmp_path: Path) -> None:
-    text = "\n".join(f"def {name}(*given): ..." for name in SLOTS)
-
-    (found,) = configurations_of([written(tmp_path, "own.py", text)])
-
-    assert list(found.slots) == list(SLOTS)
-    assert set(SLOTS) <= set(inspect.signature(Mapper).parameters)
-
-
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
@@ -112,10 +101,3 @@ def test_a_function_of_a_module_is_a_configuration_as_for_the_demo(
 
     assert (found.name, found.source, list(found.slots)) == ("compared_features:mine", path, ["features"])
     assert "has no function other" in refusal("compared_features:other").message
-
-
-def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
-    words = [written(tmp_path / folder, "mine.toml", "depth = true\n") for folder in ("a", "b")]
-
-    with pytest.raises(UsageError, match="two configurations are called mine"):
-        configurations_of(words)

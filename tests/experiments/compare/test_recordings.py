@@ -18,13 +18,6 @@ def flat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recordings, "open_recording", lambda word, **_: flat_drive(20).dataset)
 
 
-def test_a_rendered_world_has_a_name_and_a_seed() -> None:
-    (drive,) = drives_of(["world:12"], [])
-
-    assert (drive.dataset.name, len(drive.dataset), drive.rate_hz) == ("world-12", 80, pytest.approx(5.0))
-    assert drive.dataset.truth is not None
-
-
 @pytest.mark.usefixtures("flat")
 def test_each_rate_is_a_drive_and_one_above_the_recordings_plays_all_and_says_so() -> None:
     drives = drives_of(["x"], [5.0, 60.0, 10.0])
@@ -35,12 +28,6 @@ def test_each_rate_is_a_drive_and_one_above_the_recordings_plays_all_and_says_so
     ]
     assert drives[0].notes == ()
     assert drives[1].notes == ("--rate 60 is above the recording's 10 Hz: all frames are played",)
-
-
-@pytest.mark.usefixtures("flat")
-def test_two_recordings_of_one_name_are_refused() -> None:
-    with pytest.raises(UsageError, match="two recordings are called flat: a and b"):
-        drives_of(["a", "b"], [])
 
 
 def test_a_wrong_path_is_one_line(tmp_path: Path) -> None:

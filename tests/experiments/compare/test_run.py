@@ -89,13 +89,6 @@ def test_it_writes_a_table_a_picture_and_the_trajectories(
     assert len(read_trajectory(path)) == 7
 
 
-def test_several_runs_say_that_they_are_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = compare(tmp_path, "default", runs=2)
-
-    assert report["rows"][0]["same_poses_in_all_runs"] is True
-    assert "2 runs each, with the same poses to the last bit" in capsys.readouterr().out
-
-
 def test_runs_that_differ_show_the_least_and_the_largest_value() -> None:
     drive = flat_drive()
     (configuration,) = configurations_of(["default"])
@@ -139,17 +132,6 @@ def test_evo_stands_beside_ours_where_its_command_is_found(
 
     assert report["rows"][0]["figures"]["evo_ate_cm"] == [1.2345, 1.2345]
     assert "evo cm" in capsys.readouterr().out
-
-
-def test_an_evo_that_fails_gives_no_figure(tmp_path: Path) -> None:
-    command = tmp_path / "evo_ape"
-    command.write_text("#!/bin/sh\necho 'rmse 1.0'\nexit 1\n")
-    command.chmod(0o755)
-    done = asyncio.run(track(configurations_of(["default"])[0], flat_drive(), InProcessSolver(SETTINGS)))
-    assert done.errors is not None
-
-    assert evo_ate_cm(str(command), done.errors) is None
-    assert evo_ate_cm(str(tmp_path / "nothing"), done.errors) is None
 
 
 @pytest.mark.parametrize("with_scale", [False, True])

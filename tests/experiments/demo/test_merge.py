@@ -11,8 +11,7 @@ import pytest
 
 from client_sdk.point_map import read_ply
 from client_sdk.trajectory import Trajectory, read_trajectory
-from rse_pf.errors import CommandFailed
-from rse_pf.extensions.experiments.demo.merge import MAP_FILE, MERGED_MAP, print_tenths, write_merged
+from rse_pf.extensions.experiments.demo.merge import MAP_FILE, MERGED_MAP, write_merged
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.services.mapping.merge import MergeReply, MergeRequest, merge_maps
 from tests.kit.synthetic_maps import make_world
@@ -77,27 +76,3 @@ def test_robots_that_share_views_end_in_one_map_and_others_are_left_out(tmp_path
     assert len(read_trajectory(tmp_path / "robot-2" / "merged_trajectory.txt")) == 13
     assert not (tmp_path / "robot-3" / "merged_trajectory.txt").exists()
     assert (tmp_path / "map_merged.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_robot_without_keyframes_is_named(tmp_path: Path) -> None:
-    a, _ = WORLD.walk("robot-1", np.linspace(0.0, 0.2, 4), seed=1)
-    paths = demo_folder(tmp_path, [a, MapVersion(keyframes=())])
-
-    with pytest.raises(CommandFailed, match="robot-2 has no keyframe"):
-        merge(tmp_path, paths, [None, None])
-
-
-def test_progress_is_a_line_for_each_tenth_and_never_decreases():
-    printed: list[str] = []
-    report = print_tenths(printed.append)
-
-    report(0.0, "waits for its turn")
-    report(0.0, "starts")
-    for step in range(100):
-        report(0.1 + 0.007 * step, f"pair {step}")
-    report(0.2, "pair 14 again, elsewhere")
-    report(1.0, "merged")
-
-    assert printed[0] == "merging the maps: 0 %, waits for its turn"
-    assert [int(line.split()[3]) for line in printed] == [0, 10, 20, 30, 40, 50, 60, 70, 100]
-    assert printed[-1] == "merging the maps: 100 %, merged"

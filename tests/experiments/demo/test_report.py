@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,32 +37,6 @@ def report(truth: Trajectory | None):
     return make_report(
         [finished(truth)], [COMMAND], {"rate_hz": 5.0}, {"settings_digest": "d", "load_average": [0]}, [0]
     )
-
-
-def test_the_errors_are_computed_against_the_truth():
-    made = report(walk())
-    assert made["ate_cm"][0] == pytest.approx(1.0, abs=0.15)
-    assert made["rpe_cm"][0] == pytest.approx(2.0, abs=0.01)
-    assert made["lost_frames"] == 1
-    assert made["paper"]["round_trip_ms"] == 156.36
-
-
-def test_without_a_truth_no_errors_are_reported():
-    made = report(None)
-    assert made["ate_cm"] == [None]
-    assert "ATE" not in closing_lines(made, Path("out"))
-
-
-def test_a_path_without_metres_has_neither_a_length_nor_errors():
-    made = make_report(
-        [finished(walk()), replace(finished(walk()), is_metric=False)], [COMMAND], {"rate_hz": 5.0},
-        {"settings_digest": "d", "load_average": [0]}, [0],
-    )  # fmt: skip
-    text = closing_lines(made, Path("out"))
-
-    assert (made["ate_cm"][1], made["path_m"][1], made["up_to_scale"]) == (None, None, [2])
-    assert made["ate_cm"][0] is not None
-    assert "up to scale, with neither depth, a second camera nor an IMU: robot-2\n" in text
 
 
 @pytest.mark.parametrize(
@@ -114,13 +87,3 @@ def test_a_run_in_which_most_frames_have_no_pose_has_failed(lost: int, before: i
     assert (
         f"failed: {lost + before} of 10 frames have no pose" in closing_lines(made, Path("out"))
     ) is failed
-
-
-def test_a_run_without_answers_says_so_instead_of_none() -> None:
-    silent = make_report(
-        [finished(None)], [], {"rate_hz": 5.0}, {"settings_digest": "d", "load_average": [0]}, [0]
-    )
-
-    first = closing_lines(silent, Path("out")).splitlines()[0]
-    assert first.startswith("1 robot tracked 10 frames, 1 lost; no command was answered; 0 of 0 commands")
-    assert "None" not in first

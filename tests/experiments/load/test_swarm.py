@@ -13,7 +13,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.load.payloads import SolvedPayload, is_right, make_payloads
 from rse_pf.extensions.experiments.load.run import report_of, table_of
-from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario, write_scenario
+from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario
 from rse_pf.extensions.experiments.load.swarm import SwarmResult, records_of
 from rse_pf.extensions.experiments.load.swarm_process import ResultRows, plan_s
 from rse_pf.extensions.experiments.results.records import CommandRecord
@@ -30,20 +30,6 @@ def options(**changes: Any) -> LoadScenario:
 
 def payloads(**changes: Any) -> list[SolvedPayload]:
     return make_payloads(options(**changes), SessionSettings())
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("robots", 0), ("fps", 0.0), ("fps", math.nan), ("fps", math.inf), ("matches", 3), ("outliers", 1.0),
-        ("codec", "xml"), ("service", "pmp"), ("link", "moon"), ("processes", 0), ("deadline_s", 0.0),
-        ("join_every_s", -1.0), ("seed", -1),
-    ],
-)  # fmt: skip
-def test_options_out_of_range_are_refused_with_a_hint(name: str, value: Any) -> None:
-    with pytest.raises(UsageError) as told:
-        LoadScenario(**{"robots": 2, name: value})
-    assert told.value.hint
 
 
 def test_send_times_are_fixed_before_the_run_and_evenly_spread_over_the_robots() -> None:
@@ -74,25 +60,6 @@ def test_right_and_wrong_solutions_of_every_payload_are_recognised(codec_name: s
             assert not is_right(problem, {"T_camera_world": moved.ravel().tolist()})
 
 
-@pytest.mark.parametrize("reply", [None, {}, {"T_camera_world": [1.0]}, {"T_camera_world": "x"}, 7])
-def test_a_reply_without_a_pose_is_wrong(reply: Any) -> None:
-    assert not is_right(payloads()[0], reply)
-
-
-def test_an_echo_is_right_only_if_it_equals_the_payload() -> None:
-    problem = payloads(service="echo", matches=5)[0]
-    assert is_right(problem, {"value": list(problem.echo or [])})
-    assert not is_right(problem, {"value": [0.5]})
-
-
-def test_equal_seeds_make_equal_payloads() -> None:
-    def encoded(seed: int) -> list[bytes]:
-        return [problem.payload.encoded for problem in payloads(seed=seed)[:3]]
-
-    assert encoded(1) == encoded(1)
-    assert encoded(1) != encoded(100)
-
-
 def rows() -> ResultRows:
     told = ResultRows()
     nan = math.nan
@@ -105,15 +72,6 @@ def rows() -> ResultRows:
         told.servers.append(server)
         told.codes.append(code)
     return told
-
-
-def test_the_round_trip_counts_from_the_planned_time() -> None:
-    answered, failed, lost = records_of(rows())
-    assert answered.robot == "robot-5"
-    assert (answered.planned, answered.sent, answered.round_trip_ms) == (1.0, 1.01, pytest.approx(130.0))
-    assert (answered.up_ms, answered.queue_ms, answered.compute_ms, answered.down_ms) == (1.5, 0.25, 2.0, 3.0)
-    assert (failed.code, failed.round_trip_ms, failed.answered) == ("expired", None, 6.2)
-    assert (lost.code, lost.answered) == ("", None)
 
 
 def result(commands: list[CommandRecord]) -> SwarmResult:
@@ -134,16 +92,6 @@ def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
     assert report["answered_in_time_percent"] == pytest.approx(33.333)
     assert report["generator"]["cpu_percent"] == 20.0
     assert report["fps_per_robot"]["mean"] == pytest.approx(1 / 0.6, rel=1e-3)
-
-
-def test_a_scenario_is_read_as_it_was_written(tmp_path: Path) -> None:
-    asked = LoadScenario(robots=3, fps=2.5, link="paper", keep=False, service="echo", seconds=1.5)
-    assert read_scenario(write_scenario(tmp_path / "made", asked)) == asked
-
-
-def test_what_a_scenario_leaves_out_has_its_default(tmp_path: Path) -> None:
-    (tmp_path / "made").write_text('{"robots": 7}')
-    assert read_scenario(tmp_path / "made") == LoadScenario(robots=7)
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.paper.elasticity import (
     CpuCost,
     crashes,
     elasticity_figures,
-    find_unjustified_scale_outs,
 )
 from rse_pf.extensions.experiments.results.records import Records
 
@@ -37,17 +35,6 @@ def test_two_crashes_need_two_replacements():
 
     assert [each["replaced_in_s"] for each in crashes(events)] == [2.0, None]
     assert elasticity_figures(run(events))["replaced_in_s"] is None
-
-
-def test_a_scale_out_without_samples_is_reported():
-    grow = event(30.0, "grow", servers=1, reason="CPU at 80 %")
-
-    assert "none" in find_unjustified_scale_outs(run([grow]))[0]
-
-
-def test_a_run_without_parameters_is_refused():
-    with pytest.raises(UsageError, match="which experiment"):
-        elasticity_figures(Records(commands=[], events=[], samples=[]))
 
 
 def test_the_emulated_cores_make_all_robots_need_five_servers_at_the_limit():

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import pytest
-
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.paper.harness import generator_of, policy_parameters
-from rse_pf.extensions.experiments.results.records import Records
+from rse_pf.extensions.experiments.paper.harness import policy_parameters
 
 
 def test_compression_shortens_periods_but_no_threshold():
@@ -17,8 +13,3 @@ def test_compression_shortens_periods_but_no_threshold():
     assert {name: fast[name] for name in fast if name not in ("period_s", "idle_s")} == {
         name: full[name] for name in full if name not in ("period_s", "idle_s")
     }
-
-
-def test_a_run_that_did_not_end_has_no_generator():
-    with pytest.raises(UsageError, match="generator"):
-        generator_of(Records(commands=[], events=[], samples=[]))

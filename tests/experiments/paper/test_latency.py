@@ -28,7 +28,3 @@ def test_a_failed_command_was_not_answered_in_time():
     judged = judge([command(1), command(2), late, failed])
 
     assert judged["answered_within_150_ms_percent"] == 50.0
-
-
-def test_without_clocks_there_is_no_rest():
-    assert judge([command(1, up_ms=None, down_ms=None)])["rest_ms_mean"] is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 from dataclasses import replace
 
@@ -94,29 +93,6 @@ def test_an_edited_report_differs(run):
     assert differing(run) == ["commands/failed", "round_trip_ms/p99"]
 
 
-def test_a_figure_that_the_report_leaves_out_differs(run):
-    report = json.loads((run / "report.json").read_text())
-    del report["final_servers"]
-    write_json(run / "report.json", report)
-
-    assert differing(run) == ["final_servers"]
-
-
-def test_an_edited_command_differs(run):
-    rows = (run / "commands.csv").read_text().splitlines()
-    rows[5] = rows[5].replace(",ok,", ",busy,")
-    (run / "commands.csv").write_text("\n".join(rows) + "\n")
-
-    assert {"commands/answered", "commands/failed"} <= set(differing(run))
-
-
-def test_a_removed_command_differs(run):
-    rows = (run / "commands.csv").read_text().splitlines()
-    (run / "commands.csv").write_text("\n".join(rows[:-1]) + "\n")
-
-    assert "commands/sent" in differing(run)
-
-
 def test_a_round_trip_that_contradicts_its_time_stamps_breaks_an_invariant(run):
     edit(run / "commands.csv", ",20.0,", ",2.0,")
     write_report(run)
@@ -126,22 +102,9 @@ def test_a_round_trip_that_contradicts_its_time_stamps_breaks_an_invariant(run):
     ]
 
 
-def test_an_edited_sample_differs(run):
-    edit(run / "samples.csv", "90.0", "10.0")
-
-    assert "cpu_percent_series" in differing(run)
-
-
 def test_a_scale_out_that_the_samples_do_not_justify_breaks_the_invariant(run):
     text = (run / "samples.csv").read_text()
     (run / "samples.csv").write_text(text.replace("90.0", "60.0"))
-    write_report(run)
-
-    assert differing(run) == ["invariant: every scale-out follows the required busy samples"]
-
-
-def test_a_scale_out_before_enough_busy_periods_breaks_the_invariant(run):
-    edit(run / "events.jsonl", '"time": 6.05', '"time": 4.05')
     write_report(run)
 
     assert differing(run) == ["invariant: every scale-out follows the required busy samples"]
@@ -172,34 +135,10 @@ def test_every_run_of_a_folder_is_verified_by_its_name(run, tmp_path):
     assert differing(whole) == ["second: cpu_percent_series", "third: run"]
 
 
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    (tmp_path / "report.json").write_text("{}")
-    with pytest.raises(UsageError, match="holds no run"):
-        verify(tmp_path)
-
-
 @pytest.mark.parametrize("name", ["commands.csv", "events.jsonl", "samples.csv", "report.json"])
 def test_a_malformed_file_is_one_line_not_a_traceback(run, name):
     (run / name).write_text("time,nonsense\n1,{{\n")
     with pytest.raises(UsageError, match=r"cannot read|is not a report"):
-        verify(run)
-
-
-def test_duplicates_counted_by_the_load_generator_differ(run):
-    with (run / "events.jsonl").open("a") as file:
-        EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
-
-    assert differing(run) == ["commands/twice", "wrong_poses", "invariant: no answer was delivered twice"]
-
-
-def test_compressed_commands_are_read_like_plain_ones(run):
-    plain = run / "commands.csv"
-    (run / "commands.csv.gz").write_bytes(gzip.compress(plain.read_bytes()))
-    plain.unlink()
-    assert differing(run) == []
-
-    (run / "commands.csv.gz").write_bytes(b"not packed at all")
-    with pytest.raises(UsageError, match="cannot read"):
         verify(run)
 
 
@@ -214,11 +153,3 @@ def test_the_targets_of_a_fault_are_verified_too(run):
     report["bars"]["replaced_in_s"]["held"] = True
     write_json(run / "report.json", report)
     assert differing(run) == ["bars/replaced_in_s/held"]
-
-
-def test_several_experiments_of_a_folder_are_verified_by_their_names(run, tmp_path_factory):
-    whole = tmp_path_factory.mktemp("results")
-    (whole / "first").symlink_to(run)
-    edit(run / "samples.csv", "90.0", "10.0")
-
-    assert differing(whole) == ["first: cpu_percent_series"]

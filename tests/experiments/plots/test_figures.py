@@ -9,11 +9,9 @@ import pytest
 
 from rse_pf.errors import MissingExtra
 from rse_pf.extensions.experiments.paper.latency import latency_figures
-from rse_pf.extensions.experiments.paper.robustness import robustness_figures
 from rse_pf.extensions.experiments.plots.figures import (
     draw_elasticity,
     draw_latency,
-    draw_robustness,
     require_matplotlib,
 )
 from rse_pf.extensions.experiments.results.records import CommandRecord, Records, run_sample
@@ -88,16 +86,6 @@ def test_draws_latency_beside_the_paper_also_without_answers(tmp_path, records):
     draw_latency(tmp_path / "latency.png", latency_figures(records), "a caption")
 
     assert is_drawn(tmp_path / "latency.png")
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_draws_every_fault(tmp_path, count):
-    runs = {f"kill-{n}": fleet() for n in range(count)}
-    rows = {name: robustness_figures(records) for name, records in runs.items()}
-
-    draw_robustness(tmp_path / "faults.png", runs, rows)
-
-    assert is_drawn(tmp_path / "faults.png")
 
 
 def test_a_missing_extra_is_named_before_anything_runs(monkeypatch):

@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 from client_sdk.trajectory import Trajectory, write_trajectory
-from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.live_error import (
     LIVE_RECORDS,
     TRUTH,
-    final_trajectory,
     live_figures,
     live_lines,
     read_live_drives,
-    read_live_map,
 )
 from rse_pf.geometry import Array, Camera, exp_se3, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
@@ -95,19 +92,6 @@ def test_figures_say_errors_joins_and_delays(tmp_path: Path) -> None:
     assert "2 of 2 in one live map" in live_lines(live, 2)
 
 
-def test_errors_are_not_told_while_a_robot_has_not_joined(tmp_path: Path) -> None:
-    write_drive(tmp_path, "robot-1", 0, joins_at=0, off_m=0.0)
-    write_drive(tmp_path, "robot-3", 1, joins_at=None, off_m=0.0)
-    drives = read_live_drives(tmp_path, ["robot-1", "robot-3"])
-
-    live = live_figures(drives, published())
-
-    assert (live["final_ate_cm"], live["online_ate_cm"], live["joined"]) == (None, None, 1)
-    assert len(final_trajectory(drives[1], published())) == 0
-    assert live_figures(drives, None)["keyframes_in_map"] is None
-    assert "1 of 2" in live_lines(live, 2)
-
-
 @pytest.mark.parametrize(
     ("scales", "says"), [(("up to scale", "up to scale"), True), (("up to scale", "metric, by depth"), False)]
 )
@@ -124,15 +108,3 @@ def test_a_map_of_robots_with_one_lens_says_why_none_joined(
 
     assert ("no robot has metres" in lines) == says
     assert ("hint: let one of them have depth" in lines) == says
-
-
-def test_damaged_records_are_told(tmp_path: Path) -> None:
-    (tmp_path / "robot-1").mkdir()
-    (tmp_path / "robot-1" / LIVE_RECORDS).write_text('{"event": "tea"}\n')
-    (tmp_path / "live.rsemap").write_bytes(b"no map")
-
-    with pytest.raises(UsageError, match=r"cannot read .*live\.jsonl"):
-        read_live_drives(tmp_path, ["robot-1"])
-    with pytest.raises(UsageError, match=r"cannot read .*live\.rsemap"):
-        read_live_map(tmp_path)
-    assert read_live_map(tmp_path / "robot-1") is None

@@ -15,7 +15,7 @@ from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.live_error import LIVE_RECORDS, TRUTH
 from rse_pf.extensions.experiments.results.live_faults import fault_rows, live_fault_figures
 from rse_pf.extensions.experiments.results.log_replay import read_log
-from rse_pf.extensions.experiments.results.records import CommandRecord, Records
+from rse_pf.extensions.experiments.results.records import Records
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.live_map.events import KeyframeAdded, MapServerChanged, encode_events
@@ -109,46 +109,10 @@ def test_a_keyframe_that_is_lost_twice_or_out_of_order_shows(
     assert f"keyframes/{what}" in fault_rows({"kill": run})[1][-1]
 
 
-def test_a_frame_that_is_sent_again_under_another_number_counts_as_twice(tmp_path: Path) -> None:
-    logged = [*map(keyframe, NUMBERS), keyframe(4, stamp=0.2)]
-
-    assert live_fault_figures(write_run(tmp_path, logged))["keyframes"]["twice"] == 1
-
-
 def test_another_map_than_that_of_the_log_shows(tmp_path: Path) -> None:
     records = write_run(tmp_path, [keyframe(number) for number in NUMBERS], digest="of another map")
 
     assert not live_fault_figures(records)["bars"]["replay_equal"]["held"]
-
-
-def test_the_release_of_a_lease_begins_the_time_without_an_owner(tmp_path: Path) -> None:
-    records = write_run(tmp_path, [keyframe(number) for number in NUMBERS], fault="drain")
-    released = {"time": RELEASED_S, "action": "lease", "owner": "one", "state": "released", "epoch": 1}
-    events = sorted([*records.events, released], key=lambda each: float(each["time"]))
-
-    run = live_fault_figures(Records(commands=[], events=events, samples=[], folder=records.folder))
-
-    assert run["new_owner_s"] == SERVING_S - RELEASED_S
-
-
-def test_a_keyframe_that_is_sent_while_a_pose_is_asked_for_is_counted(tmp_path: Path) -> None:
-    records = write_run(tmp_path, [keyframe(number) for number in NUMBERS], fault="wifi")
-    asked = CommandRecord(
-        id=1, robot="robot-1", planned=0.35, sent=0.35, answered=0.45, server="server-1", code="ok"
-    )
-
-    run = live_fault_figures(Records(commands=[asked], events=records.events, samples=[], folder=tmp_path))
-
-    assert run["keyframes"]["ahead_of_poses"] == 1
-
-
-def test_a_log_with_a_gap_is_told(tmp_path: Path) -> None:
-    objects = tmp_path / "platform" / "objects"
-    write_run(tmp_path, [keyframe(number) for number in NUMBERS])
-    DirectoryStore(objects).delete(f"{map_folder(DEFAULT_TENANT, 'demo')}log/{2:012d}")
-
-    with pytest.raises(UsageError, match="cannot replay the log"):
-        read_log(objects, 6)
 
 
 def test_a_log_is_replayed_with_one_thread_as_owners_compute(

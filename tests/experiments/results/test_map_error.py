@@ -10,11 +10,8 @@ from rse_pf.extensions.experiments.results.map_error import (
     JoinedRobot,
     joined_robots,
     merge_section,
-    merged_lines,
-    merged_table,
-    move_frames,
 )
-from rse_pf.geometry import exp_se3, inverse
+from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply, NotJoined, Refusal
 from tests.kit.synthetic_maps import make_world
@@ -49,39 +46,6 @@ def robot(name: str, own: Trajectory, merged: Trajectory, truth: Trajectory | No
 def section(robots: list[JoinedRobot], reply: MergeReply = REPLY) -> dict[str, object]:
     names = ["robot-1", "robot-2", "robot-3"]
     return merge_section(names, robots, reply, MapVersion(keyframes=()), {"merged_by": "a test"})
-
-
-def test_frames_move_rigidly_with_their_keyframes() -> None:
-    path = circle(np.linspace(0, 0.5, 21))
-    T = exp_se3(np.array([1.0, -2.0, 0.5, 0.4, 0.2, -0.9]))
-    rows = [0, 8, 20]
-
-    moved = move_frames(
-        path, path.timestamps_s[rows], path.T_world_camera[rows], T @ path.T_world_camera[rows]
-    )
-
-    np.testing.assert_allclose(moved.T_world_camera, T @ path.T_world_camera, atol=1e-9)
-
-
-def test_a_frame_between_two_keyframes_gets_an_interpolated_correction() -> None:
-    path = circle(np.zeros(5))
-    corrected = path.T_world_camera[[0, 4]].copy()
-    corrected[1, 0, 3] += 0.08
-
-    moved = move_frames(path, path.timestamps_s[[0, 4]], path.T_world_camera[[0, 4]], corrected)
-
-    shifts = moved.positions[:, 0] - path.positions[:, 0]
-    np.testing.assert_allclose(shifts, [0.0, 0.02, 0.04, 0.06, 0.08], atol=1e-9)
-
-
-def test_a_frame_after_the_last_keyframe_follows_it() -> None:
-    path = circle(np.linspace(0, 0.1, 3))
-    shifted = path.T_world_camera[:1].copy()
-    shifted[0, 2, 3] += 1.0
-
-    moved = move_frames(path, path.timestamps_s[:1], path.T_world_camera[:1], shifted)
-
-    np.testing.assert_allclose(moved.positions - path.positions, np.tile([0.0, 0.0, 1.0], (3, 1)), atol=1e-9)
 
 
 def test_poses_are_found_by_the_maps_and_numbers_that_the_provenance_names() -> None:
@@ -145,36 +109,3 @@ def test_drift_that_the_merge_removed_is_in_the_error_before_it_only() -> None:
 
     assert made["ate_cm"] == pytest.approx(0.0, abs=1e-3)
     assert made["ate_before_cm"] == pytest.approx(2.0 * 3**0.5, rel=0.2)
-
-
-def test_without_a_truth_no_errors_are_reported() -> None:
-    path = circle(np.linspace(0, 0.4, 20))
-
-    made = section([robot("robot-1", path, path, None)])
-
-    assert made["ate_cm"] is None
-    assert "ATE" not in merged_lines(made)
-
-
-def test_the_report_names_robots_that_were_not_joined_and_why() -> None:
-    path = circle(np.linspace(0, 0.4, 20))
-    made = section([robot("robot-1", path, path, path), robot("robot-3", path, path, path)])
-
-    told, table = merged_lines(made), "\n".join(merged_table(made))
-
-    assert made["joined"] == ["robot-1", "robot-3"]
-    assert made["not_joined"] == [{"robot": "robot-2", "reason": "fewer than 3 views agree"}]
-    assert "robot-2 not joined: fewer than 3 views agree\n" in told
-    assert "9 pairs of keyframes were not linked (2 inconsistent, 7 no-matches)" in told
-    assert "| not linked between robot-1 and robot-2 | 7 no-matches |" in table
-    assert "| not linked within robot-1 | 2 inconsistent |" in table
-
-
-def test_the_origins_are_relative_to_the_first_robot() -> None:
-    one, other = circle(np.linspace(0, 0.4, 20)), circle(np.linspace(0.5, 0.9, 20))
-    T = inverse(one.T_world_camera[0])
-    moved = [Trajectory(each.timestamps_s, T @ each.T_world_camera) for each in (one, other)]
-
-    made = section([robot("a", one, moved[0], one), robot("c", other, moved[1], other)])
-
-    assert made["origins"][0]["cm"] == 0.0  # type: ignore[index]

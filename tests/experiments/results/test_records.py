@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-import io
-import json
-from dataclasses import replace
-
 import pytest
 
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.records import (
-    CommandRecord,
-    EventLog,
     SampleLog,
     read_commands,
     read_samples,
     run_sample,
     sample_from_document,
-    write_commands,
 )
 
 ORIGIN_S = 1000.0
-GOOD = CommandRecord(
-    id=1, robot="robot-1", planned=0.0, sent=0.01, answered=0.05, server="a", code="ok",
-    payload_bytes=100, round_trip_ms=40.0, compute_ms=3.0,
-)  # fmt: skip
-
-
-def test_commands_are_read_back_as_they_were_written(tmp_path):
-    commands = [GOOD, replace(GOOD, id=2, code="", answered=None, round_trip_ms=None)]
-    write_commands(tmp_path / "commands.csv", commands)
-    assert read_commands(tmp_path / "commands.csv") == commands
 
 
 def test_a_malformed_file_is_one_line_with_a_hint(tmp_path):
@@ -39,12 +22,6 @@ def test_a_malformed_file_is_one_line_with_a_hint(tmp_path):
         read_commands(tmp_path / "commands.csv")
     with pytest.raises(UsageError, match="cannot read"):
         read_commands(tmp_path / "nothing.csv")
-
-
-def test_events_are_lines_of_json_written_at_once():
-    file = io.StringIO()
-    EventLog(file).write(1.5, "server-killed", server="a", pid=7)
-    assert json.loads(file.getvalue()) == {"time": 1.5, "action": "server-killed", "server": "a", "pid": 7}
 
 
 def test_samples_of_the_monitor_are_read_back_as_they_were_written(tmp_path):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures, rerun_plan
+from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_figures, rerun_plan
 
 WIFI = "wifi/first_answer_after_heal_s/p99"
 
@@ -42,29 +42,9 @@ def test_slack_allows_no_lost_command_and_no_missing_figure():
     assert missed(report(1.0), {"runs": {}}) == [WIFI, "wifi/commands/lost"]
 
 
-def test_of_a_figure_for_each_robot_the_worst_counts():
-    plan = rerun_plan([], {"ate_cm": (1.0, "<="), "scale_outs": (2.0, ">=")})
-    shipped = {"experiment": "map", "ate_cm": [0.8, 1.0], "scale_outs": 4, RERUN: plan}
-
-    assert missed(shipped, {"ate_cm": [0.5, 1.4], "scale_outs": 2}) == []
-    assert missed(shipped, {"ate_cm": [0.5, 1.6], "scale_outs": 1}) == ["ate_cm", "scale_outs"]
-    assert missed(shipped, {"ate_cm": [0.5, None], "scale_outs": 2}) == ["ate_cm"]
-
-
-def test_the_arguments_of_the_short_run_are_those_of_the_report():
-    assert rerun_arguments(report(1.0)) == ["robustness", "--robots", "20", "--only", "wifi"]
-
-
 @pytest.mark.parametrize(
     "plan", [{"slack": 0.5}, {"slack": "much"}, {"bars": {WIFI: "< 2"}}, {"bars": 7}, {"bars": {WIFI: 2.0}}]
 )
 def test_a_damaged_plan_is_one_line(plan: dict[str, Any]):
     with pytest.raises(UsageError, match="short form in the report is damaged"):
         rerun_figures(report(1.0, **plan), report(1.0))
-
-
-def test_a_report_without_a_plan_says_what_to_do():
-    with pytest.raises(UsageError, match="no short form") as refused:
-        rerun_arguments({"experiment": "robustness"})
-
-    assert "run the experiment again" in str(refused.value.hint)

@@ -15,7 +15,6 @@ from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.extensions.experiments.load.run import run_swarm
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.results.result_folder import (
-    RUN_FILES,
     commit_of,
     finish_report,
     fresh_folder,
@@ -33,45 +32,6 @@ def test_all_results_of_an_earlier_run_are_removed(tmp_path):
     fresh_folder(out, ("report.*", "robustness.png", "kill", "stop"))
 
     assert list(out.iterdir()) == []
-
-
-def test_files_of_others_are_not_touched(tmp_path):
-    (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(UsageError, match="holds other files"):
-        fresh_folder(tmp_path, RUN_FILES)
-    assert (tmp_path / "thesis.tex").exists()
-
-
-def test_a_folder_named_like_a_result_is_not_removed_without_the_events_of_a_run(tmp_path):
-    (tmp_path / "platform").mkdir()
-    with pytest.raises(UsageError, match="holds other files"):
-        fresh_folder(tmp_path, RUN_FILES)
-    assert (tmp_path / "platform").is_dir()
-
-
-@pytest.mark.parametrize("other", ["notes.txt", "mine", "platform"])
-def test_results_beside_a_file_of_others_are_refused_and_nothing_is_removed(tmp_path, other):
-    for name in ("events.jsonl", "report.json", "map.png"):
-        (tmp_path / name).write_text("")
-    for name in ("robot-1", "run"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "run" / "events.jsonl").write_text("")
-    if other == "notes.txt":
-        (tmp_path / other).write_text("")
-    else:
-        (tmp_path / other).mkdir()
-    before = sorted(tmp_path.rglob("*"))
-
-    with pytest.raises(UsageError, match="holds other files"):
-        fresh_folder(tmp_path, ["events.jsonl", "report.json", "map.png", "robot-*", "run"])
-
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
-    (tmp_path / "out").write_text("")
-    with pytest.raises(UsageError, match="is a file"):
-        fresh_folder(tmp_path / "out", RUN_FILES)
 
 
 def test_a_report_names_machine_load_and_settings(tmp_path):

@@ -11,8 +11,6 @@ from rse_pf.config.resource_names import READY_PATH
 from rse_pf.local.balancer.envoy_config import (
     CLUSTER,
     DATA_CLUSTER,
-    ROSBRIDGE_CLUSTER,
-    Target,
     endpoints,
     envoy_config,
 )
@@ -93,33 +91,6 @@ def test_health_checks_follow_the_settings() -> None:
     assert check["http_health_check"] == {"path": READY_PATH}
 
 
-def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
-    assert only_route(config())["match"] == {"path": "/ws"}
-
-
-def test_rosbridge_has_a_way_to_its_server_and_from_there_without_tls_if_it_is_switched_on() -> None:
-    made = config(
-        serving={"rosbridge": True}, local={"certificate": "/tls/chain.pem", "private_key": "/tls/key.pem"}
-    )
-    (rosbridge,) = [each for each in routes(made) if each["match"] == {"path": "/rosbridge"}]
-    front, loopback = made["static_resources"]["listeners"]
-
-    assert rosbridge["route"] == {**only_route(config())["route"], "cluster": ROSBRIDGE_CLUSTER}
-    assert "transport_socket" in front["filter_chains"][0]
-    assert "transport_socket" not in loopback["filter_chains"][0]
-    assert loopback["address"]["socket_address"]["address"] == "127.0.0.1"
-    assert not [each for each in routes(config()) if each["match"] == {"path": "/rosbridge"}]
-
-
-def test_headers_are_bounded_in_number_size_and_time() -> None:
-    made = manager(config(session={"hello_timeout_s": 1.5}))
-
-    assert made["request_headers_timeout"] == "1.5s"
-    assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"
-    assert made["max_request_headers_kb"] == 8
-    assert made["common_http_protocol_options"]["max_headers_count"] <= 100
-
-
 def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer() -> None:
     made = config()
     ways = [each for each in routes(made) if each.get("route", {}).get("cluster") == DATA_CLUSTER]
@@ -144,15 +115,6 @@ def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer(
     ]  # fmt: skip
 
 
-def test_connections_and_buffers_are_bounded() -> None:
-    made = config()
-    (monitor,) = made["overload_manager"]["resource_monitors"]
-
-    assert monitor["typed_config"]["max_active_downstream_connections"] == "12000"
-    assert listener(made)["per_connection_buffer_limit_bytes"] == 262_144
-    assert cluster(made)["per_connection_buffer_limit_bytes"] == 262_144
-
-
 def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
     made = config(session={"ping_interval_s": 2.0, "ping_timeout_s": 1.0})
     options = {(each["level"], each["name"]): each["int_value"] for each in listener(made)["socket_options"]}
@@ -163,13 +125,3 @@ def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
         (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT): 6000,
     }
     assert (upstream["name"], upstream["int_value"]) == (socket.SO_RCVBUF, 262_144)
-
-
-def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:
-    made = endpoints([Target(name="a", port=1001, control_port=2001)])
-    (resource,) = made["resources"]
-    ((member,),) = [each["lb_endpoints"] for each in resource["endpoints"]]
-
-    assert resource["cluster_name"] == CLUSTER
-    assert member["endpoint"]["address"]["socket_address"]["port_value"] == 1001
-    assert member["endpoint"]["health_check_config"]["port_value"] == 2001

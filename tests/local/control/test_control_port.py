@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import AsyncIterator, Mapping
 
 import pytest
@@ -39,13 +38,6 @@ def answer(request: bytes) -> bytes:
     return asyncio.run(run())
 
 
-def test_the_document_is_told() -> None:
-    head, _, body = answer(b"GET /status HTTP/1.1\r\nHost: x\r\n%s\r\n" % CARRIED).partition(b"\r\n\r\n")
-
-    assert head.startswith(b"HTTP/1.1 200 OK\r\n")
-    assert json.loads(body) == {"platform": "a"}
-
-
 @pytest.mark.parametrize(
     ("request_", "status"),
     [
@@ -71,21 +63,6 @@ def test_a_broken_question_ends_its_own_connection(broken: bytes) -> None:
 async def steps() -> AsyncIterator[dict[str, object]]:
     yield {"event": "drain-start", "server": "server-1"}
     yield {"event": "operation-over"}
-
-
-def test_an_operation_is_answered_with_a_line_for_each_event() -> None:
-    head, _, body = answer(b"POST /drain?server=server-1 HTTP/1.1\r\n%s\r\n" % CARRIED).partition(b"\r\n\r\n")
-
-    assert head.startswith(b"HTTP/1.1 200 OK\r\n")
-    events = [json.loads(line)["event"] for line in body.splitlines()]
-    assert events == ["drain-start", "operation-over"]
-
-
-def test_a_refused_operation_says_why() -> None:
-    told = answer(b"POST /drain?server=server-9 HTTP/1.1\r\n%s\r\n" % CARRIED)
-
-    assert told.startswith(b"HTTP/1.1 409 Conflict\r\n")
-    assert json.loads(told.partition(b"\r\n\r\n")[2])["message"] == "no server named 'server-9' is running"
 
 
 @pytest.mark.parametrize("header", [b"", b"Origin: https://example.org\r\n%s" % CARRIED])

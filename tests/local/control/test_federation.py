@@ -44,14 +44,6 @@ def test_every_sample_names_its_server_and_every_family_stands_once() -> None:
     assert all(len(line.split()) >= 6 for line in helps)
 
 
-def test_a_silent_server_is_down_and_has_no_other_sample() -> None:
-    text = federate_pages({"server-1": PAGE.format(n=3), "server-2": None}).decode()
-
-    assert 'rse_pf_server_up{server="server-1"} 1.0' in text
-    assert 'rse_pf_server_up{server="server-2"} 0.0' in text
-    assert text.count("server-2") == 1
-
-
 def test_the_file_for_discovery_lists_the_servers_that_are_ready() -> None:
     mark = ProcessMark(pid=1, began="1@boot")
     servers = [
@@ -62,12 +54,3 @@ def test_the_file_for_discovery_lists_the_servers_that_are_ready() -> None:
     assert json.loads(service_discovery("lab", servers)) == [
         {"targets": ["127.0.0.1:1001"], "labels": {"platform": "lab", "server": "server-1"}}
     ]
-
-
-def test_the_space_on_each_disk_is_on_the_page() -> None:
-    disk = {"folder": "/var/lib/rse-pf", "free_bytes": 4096, "total_bytes": 8192}
-
-    text = federate_pages({}, [disk]).decode()
-
-    assert 'rse_pf_disk_free_bytes{folder="/var/lib/rse-pf"} 4096.0' in text
-    assert 'rse_pf_disk_total_bytes{folder="/var/lib/rse-pf"} 8192.0' in text

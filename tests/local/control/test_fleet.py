@@ -9,8 +9,6 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.envoy_config import Target
@@ -117,32 +115,6 @@ async def a_fleet() -> AsyncIterator[World]:
     await world.fleet.close()
 
 
-async def test_a_server_gets_robots_once_it_is_ready_and_each_step_is_told() -> None:
-    async with a_fleet() as world:
-        await world.up(2)
-
-    assert world.told("server-2") == ["server-launched", "server-ready", "server-healthy"]
-    assert world.balancer.targets[-1] == ["server-1", "server-2"]
-    assert world.fleet.standing(0.0).healthy == 2
-
-
-async def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
-    async with a_fleet() as world:
-        first, _ = await world.up(2)
-        world.servers.send(first.name, signal.SIGKILL)
-        await first.over.wait()
-        while not world.fleet.dead:
-            await asyncio.sleep(0)
-        standing = world.fleet.standing(0.0)
-        assert (standing.servers, standing.healthy, dict(standing.dead)) == (2, 1, {"server-1": True})
-        assert world.balancer.targets[-1] == ["server-2"]
-
-        assert world.fleet.launch_replacement("server-1", "it ended") == "server-3"
-
-        assert world.fleet.standing(0.0).servers == 2
-        assert world.fleet.dead == {}
-
-
 async def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None:
     async with a_fleet() as world:
         first, _ = await world.up(2)
@@ -157,27 +129,6 @@ async def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -
     assert world.fleet.dead == {}
 
 
-async def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
-    async with a_fleet() as world:
-        first, _ = await world.up(2)
-        world.fleet.note_own_drain(first)
-        world.fleet.note_own_drain(first)
-        assert world.fleet.dead == {"server-1": False}
-        world.fleet.launch_replacement(first.name, "it ended")
-        assert world.servers.signals == []
-        assert [each["event"] for each in world.events].count("drain-start") == 1
-
-
-async def test_the_one_with_the_fewest_robots_is_drained_and_the_last_one_never() -> None:
-    async with a_fleet() as world:
-        for member, robots in zip(await world.up(3), (5, 2, 9), strict=True):
-            member.robots = robots
-        assert world.fleet.shrink("idle") == "server-2"
-        assert world.balancer.targets[-1] == ["server-1", "server-3"]
-        assert world.fleet.shrink("idle") == "server-1"
-        assert world.fleet.shrink("idle") is None
-
-
 async def test_a_start_that_fails_is_a_young_death_and_an_event() -> None:
     async with a_fleet() as world:
         world.servers.broken.add("server-1")
@@ -187,14 +138,6 @@ async def test_a_start_that_fails_is_a_young_death_and_an_event() -> None:
 
     assert world.fleet.dead == {"server-1": True}
     assert world.told("server-1") == ["server-launched", "server-gone", "server-failed"]
-
-
-async def test_a_wait_for_a_server_that_ends_does_not_last() -> None:
-    async with a_fleet() as world:
-        world.servers.broken.add("server-1")
-        (name,) = world.fleet.grow(1, "asked")
-        with pytest.raises(ConfigurationError, match="server-1 did not become healthy"):
-            await world.fleet.wait_until_healthy([world.fleet.members[name]], SOON_S)
 
 
 async def test_targets_stay_until_every_adopted_server_is_known_again() -> None:

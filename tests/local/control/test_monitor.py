@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.config import ServingSettings
 from rse_pf.local.control.monitor import (
     MonitorSample,
     Observed,
     Periods,
     ServerSample,
-    capacity_cores,
     monitor_sample,
-    sample_interval_s,
     server_sample,
 )
 
@@ -54,45 +51,6 @@ def test_cpu_is_relative_to_the_size_and_to_the_time_between_two_answers() -> No
     assert told.cpu_percent == 50.0
 
 
-def test_counts_are_those_of_the_interval_and_levels_are_those_of_now() -> None:
-    told = one(observed(100.0), observed(101.0, requests=40, bytes_in=500, bytes_out=5, robots=2))
-
-    assert (told.requests, told.bytes_in, told.bytes_out) == (40, 500, 5)
-    assert (told.robots, told.queue, told.queue_ms, told.in_flight) == (9, 3, 12.5, 1)
-
-
-def test_a_first_answer_has_no_cpu_and_no_answer_has_no_numbers() -> None:
-    assert one(None, observed(100.0)).cpu_percent is None
-    assert one(observed(100.0), None) == ServerSample(name="server-1", pid=5, state="healthy")
-
-
-@pytest.mark.parametrize(
-    ("size", "workers", "cores", "capacity"), [(0.25, 2, 8, 0.5), (0.0, 1, 2, 1.0), (0.0, 4, 2, 2.0)]
-)
-def test_a_server_has_the_emulated_size_of_its_workers_or_their_cores(
-    size: float, workers: int, cores: int, capacity: float
-) -> None:
-    assert capacity_cores(ServingSettings(emulated_cores=size), workers, cores) == capacity
-
-
-def test_the_mean_leaves_out_who_warms_up_and_who_does_not_answer() -> None:
-    servers = [server("a", 80.0), server("b", 40.0), server("c", 0.0, warming=True), server("d", None)]
-
-    assert monitor_sample(1.0, servers, frozenset()).cpu_percent == 60.0
-    assert monitor_sample(1.0, servers[2:], frozenset()).cpu_percent is None
-
-
-def test_healthy_is_who_passes_our_checks_and_gets_robots_from_the_balancer() -> None:
-    servers = [server("a", 1.0), server("b", 1.0), server("c", 1.0, state="draining")]
-
-    assert monitor_sample(1.0, servers, frozenset({"a", "c"})).healthy_servers == 1
-
-
-@pytest.mark.parametrize(("period_s", "every_s"), [(60.0, 1.0), (2.0, 1.0), (2.5, 2.5 / 3), (0.1, 0.25)])
-def test_readings_divide_a_period(period_s: float, every_s: float) -> None:
-    assert sample_interval_s(period_s) == pytest.approx(every_s)
-
-
 def test_a_sample_is_the_mean_over_time_of_one_period_and_the_sum_of_its_requests() -> None:
     periods = Periods(10.0, keep=4)
     over = [
@@ -115,19 +73,3 @@ def test_a_period_that_goes_on_or_was_hardly_watched_gives_no_sample() -> None:
 
     assert periods.samples(119.0) == ()
     assert [sample.start_s for sample in periods.samples(120.0)] == [110.0]
-
-
-def test_a_period_in_which_nobody_answered_gives_no_sample() -> None:
-    periods = Periods(10.0, keep=4)
-    for time_s in (100.0, 110.0, 120.0):
-        periods.add(sample_of(time_s, None))
-
-    assert periods.samples(120.0) == ()
-
-
-def test_only_the_newest_periods_are_kept() -> None:
-    periods = Periods(10.0, keep=3)
-    for number in range(9):
-        periods.add(sample_of(100.0 + 10.0 * number, 50.0))
-
-    assert [sample.start_s for sample in periods.samples(180.0)] == [150.0, 160.0, 170.0]

@@ -28,18 +28,6 @@ async def collected(events: Any) -> list[Any]:
     return [event async for event in events]
 
 
-async def test_the_events_of_the_platform_are_told_until_it_is_over() -> None:
-    operations = Operations(Kept())
-
-    async def work() -> None:
-        operations.take_event({"event": "drain-start", "server": "server-1"})
-
-    assert [
-        event["event"]
-        for event in (await asyncio.wait_for(collected(operations.begin("drain", work)), SOON_S))
-    ] == ["drain-start", OVER]
-
-
 async def test_a_failure_is_the_last_event_and_the_next_operation_may_begin() -> None:
     operations = Operations(Kept())
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
+from rse_pf.local.control.rebalancer import Rebalancer
 
 UNEVEN = {"server-1": 50, "server-2": 50, "server-3": 0}
 
@@ -13,20 +13,6 @@ def watching(robots: dict[str, int], since_s: float = 100.0) -> Rebalancer:
     rebalancer.requests(robots, since_s - 1.0)
     rebalancer.watch(since_s)
     return rebalancer
-
-
-def test_nobody_is_asked_before_something_happened() -> None:
-    rebalancer = Rebalancer()
-
-    assert [rebalancer.requests(UNEVEN, time_s) for time_s in (100.0, 101.0, 102.0)] == [()] * 3
-
-
-def test_nobody_is_asked_while_the_numbers_still_change() -> None:
-    rebalancer = watching({"server-1": 80, "server-2": 20, "server-3": 0})
-
-    assert rebalancer.requests(UNEVEN, 100.0) == (), "robots are still on their way"
-    assert rebalancer.requests({**UNEVEN, "server-4": 0}, 101.0) == (), "a server has just come"
-    assert rebalancer.requests({**UNEVEN, "server-4": 2}, 102.0) != ()
 
 
 def test_crowded_servers_are_asked_at_the_rate_that_is_allowed() -> None:
@@ -44,13 +30,3 @@ def test_an_order_is_not_repeated_before_its_robots_had_time_to_move_and_then_it
 
     assert rebalancer.requests(UNEVEN, 100.0 + longest_s) == ()
     assert rebalancer.requests(UNEVEN, 100.0 + longest_s + 2.0) != ()
-
-
-def test_even_servers_and_an_old_event_ask_nobody() -> None:
-    even = {"server-1": 5, "server-2": 5}
-    assert watching(even).requests(even, 101.0) == ()
-
-    rebalancer = watching(UNEVEN)
-    assert rebalancer.requests(UNEVEN, 131.0) == ()
-    rebalancer.watch(131.0)
-    assert isinstance(rebalancer.requests(UNEVEN, 131.0)[0], MoveRequest)

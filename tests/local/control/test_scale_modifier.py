@@ -15,7 +15,6 @@ from rse_pf.local.control.scale_modifier import LocalScaleModifier, may_start_s,
 from rse_pf.scaling.policy import Sample
 
 SCALING = ScalingSettings()
-PERIOD_S = float(SCALING.period_s)
 
 
 class FakeServers:
@@ -68,21 +67,6 @@ def made(
     return modifier, servers, told
 
 
-def samples(count: int, cpu_percent: float, requests: int = 1) -> list[Sample]:
-    return [Sample(start_s=i * PERIOD_S, cpu_percent=cpu_percent, requests=requests) for i in range(count)]
-
-
-def test_a_busy_platform_grows_once_in_a_period() -> None:
-    modifier, servers, told = made(ServerHealth(servers=2, healthy=2))
-    busy = samples(2, 75.0)
-
-    for now_s, over in ((119.0, True), (120.1, False), (120.2, True), (121.0, False), (122.0, True)):
-        modifier.act(busy, now_s=now_s, period_over=over)
-
-    assert servers.asked == [("grow", 1)]
-    assert told == [{"event": "grow", "servers": 1, "names": ["server-11"], "reason": "CPU at 75 %"}]
-
-
 def test_in_the_fast_profile_a_busy_platform_grows_after_three_samples_and_then_each_minute() -> None:
     servers = FakeServers(ServerHealth(servers=2, healthy=2))
     modifier = LocalScaleModifier(
@@ -102,23 +86,6 @@ def test_in_the_fast_profile_a_busy_platform_grows_after_three_samples_and_then_
     assert grown == [30, 90, 150]
 
 
-def test_an_idle_platform_drains_one_server() -> None:
-    modifier, servers, told = made(ServerHealth(servers=3, healthy=3))
-
-    modifier.act(samples(5, 1.0, requests=0), now_s=300.0, period_over=True)
-
-    assert servers.asked == [("shrink",)]
-    assert told[0]["event"] == "shrink"
-
-
-def test_a_shrink_that_finds_nobody_to_spare_is_no_event() -> None:
-    modifier, _, told = made(ServerHealth(servers=3, healthy=1))
-
-    modifier.act(samples(5, 1.0, requests=0), now_s=300.0, period_over=True)
-
-    assert told == []
-
-
 def test_missing_servers_are_launched_at_once_but_not_while_somebody_else_changes_the_number() -> None:
     modifier, servers, _ = made(ServerHealth(servers=1, healthy=1))
 
@@ -126,28 +93,6 @@ def test_missing_servers_are_launched_at_once_but_not_while_somebody_else_change
     assert servers.asked == []
     modifier.act([], now_s=61.0, period_over=False)
     assert servers.asked == [("grow", 1)]
-
-
-def test_the_scheduled_minimum_holds_from_its_minute_on() -> None:
-    modifier, servers, _ = made(ServerHealth(servers=2, healthy=2), minimum=lambda: scheduled)
-    scheduled = 2
-    modifier.act([], now_s=61.0, period_over=False)
-    assert servers.asked == []
-
-    scheduled = 4
-    modifier.act([], now_s=62.0, period_over=False)
-
-    assert servers.asked == [("grow", 2)]
-    assert modifier.document()["min_servers"] == 4
-
-
-def test_a_dead_server_is_replaced_at_once_also_between_periods_and_on_hold() -> None:
-    modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-1": False}))
-
-    modifier.act([], now_s=61.0, period_over=False, hold=True)
-
-    assert servers.asked == [("replace", "server-1")]
-    assert (told[0]["event"], told[0]["server"], told[0]["by"]) == ("replace", "server-1", "server-11")
 
 
 def crashes(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, Any]]]:
@@ -169,13 +114,6 @@ def test_a_crash_loop_gets_five_starts_a_minute_and_is_told_once() -> None:
     assert [event["event"] for event in told].count("crash-loop") == 1
 
 
-def test_servers_that_lived_long_are_replaced_however_many_they_are() -> None:
-    starts, told = crashes(young=False, seconds=20)
-
-    assert len(starts) == 20
-    assert "crash-loop" not in {event["event"] for event in told}
-
-
 @given(st.lists(st.floats(0.0, 300.0), max_size=30), st.integers(1, 6))
 def test_whoever_obeys_never_starts_more_than_allowed_in_any_minute(wishes: list[float], most: int) -> None:
     starts: list[float] = []
@@ -185,11 +123,6 @@ def test_whoever_obeys_never_starts_more_than_allowed_in_any_minute(wishes: list
 
     for start in starts:
         assert sum(0.0 <= later - start < 60.0 for later in starts) <= most
-
-
-def test_who_must_wait_is_told_until_when() -> None:
-    assert may_start_s([10.0, 20.0, 30.0], now_s=40.0, per_minute=2) == 80.0
-    assert may_start_s([10.0, 20.0, 30.0], now_s=85.0, per_minute=2) == 85.0
 
 
 @pytest.mark.parametrize(

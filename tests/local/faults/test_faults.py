@@ -19,13 +19,12 @@ from rse_pf.errors import UsageError
 from rse_pf.local.faults.faults import (
     cut_off,
     find_server,
-    kill_balancer,
     nft_commands,
     signal_tree,
     slow_down,
     tree,
 )
-from rse_pf.local.processes import ProcessMark, mark_of, wait_ended
+from rse_pf.local.processes import ProcessMark, mark_of
 from rse_pf.local.state import PlatformState, ServerState
 
 FAMILY = """
@@ -76,45 +75,12 @@ def state(**more: object) -> PlatformState:
     )  # fmt: skip
 
 
-def test_only_running_servers_are_found_and_named() -> None:
-    assert find_server(state(), "server-2").name == "server-2"
-    for name in ("server-1", "server-9"):
-        with pytest.raises(UsageError, match=name) as caught:
-            find_server(state(), name)
-        assert caught.value.hint == "running: server-2"
-
-
-def test_the_tree_is_the_process_and_what_it_started(family: ProcessMark) -> None:
-    marks = tree(family)
-
-    assert marks[0] == family
-    assert len(marks) == 2
-
-
 def test_a_pid_that_was_used_again_is_not_touched(family: ProcessMark) -> None:
     other = ProcessMark(pid=family.pid, began="1@another-boot")
 
     assert tree(other) == []
     assert signal_tree(other, signal.SIGKILL) == 0
     assert letter(family) in "SR"
-
-
-def test_a_stop_stops_all_and_a_resume_resumes_all(family: ProcessMark) -> None:
-    marks = tree(family)
-
-    assert signal_tree(family, signal.SIGSTOP) == 2
-    until(True, marks)
-    assert signal_tree(family, signal.SIGCONT) == 2
-    until(False, marks)
-
-
-def test_a_kill_ends_all_even_stopped_ones(family: ProcessMark) -> None:
-    marks = tree(family)
-    signal_tree(family, signal.SIGSTOP)
-
-    signal_tree(family, signal.SIGKILL)
-
-    assert all(wait_ended(mark, SOON_S) for mark in marks)
 
 
 def test_a_slowed_server_gets_its_share_and_all_of_it_afterwards(family: ProcessMark) -> None:
@@ -145,47 +111,10 @@ def threading_event_like(end: float):
     return wait
 
 
-def test_slowing_stops_and_continues_in_turns_of_the_right_length(family: ProcessMark) -> None:
-    seen: list[tuple[float, bool]] = []
-
-    def wait(seconds: float) -> bool:
-        stopped = len(seen) % 2 == 0
-        until(stopped, tree(family))
-        seen.append((round(seconds, 6), stopped))
-        return len(seen) == 4
-
-    slow_down(family, 25.0, wait)
-
-    assert seen == [(0.03, True), (0.01, False)] * 2
-
-
-def test_slowing_goes_on_even_when_it_is_cut_short(family: ProcessMark) -> None:
-    def interrupted(seconds: float) -> bool:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        slow_down(family, 50.0, interrupted)
-
-    until(False, tree(family))
-
-
-def test_slowing_ends_with_the_server(family: ProcessMark) -> None:
-    def wait(seconds: float) -> bool:
-        signal_tree(family, signal.SIGKILL)
-        return False
-
-    slow_down(family, 50.0, wait)  # returns
-
-
 @pytest.mark.parametrize("percent", [0.0, 100.0, -5.0, float("nan")])
 def test_a_share_that_is_none_is_refused(family: ProcessMark, percent: float) -> None:
     with pytest.raises(UsageError):
         slow_down(family, percent, lambda seconds: True)
-
-
-def test_a_platform_without_a_balancer_says_so() -> None:
-    with pytest.raises(UsageError, match="load balancer"):
-        kill_balancer(state())
 
 
 def test_names_and_ports_reach_nft_only_as_letters_and_numbers() -> None:

@@ -19,7 +19,6 @@ from rse_pf.local.state import control_token_file
 pytestmark = pytest.mark.system
 
 SOON_S = 20.0
-AT_ONCE_S = 0.05
 
 FAKE = """
 import json, os, signal, sys
@@ -56,26 +55,9 @@ def with_server(
     return answer, any(map(is_alive, marks.values()))
 
 
-def test_a_server_is_ready_when_it_has_announced_itself(tmp_path: Path) -> None:
-    server, left = with_server(tmp_path, FAKE % (0, ""), lambda made: made.wait_ready("server-1", SOON_S))
-
-    assert (server.name, server.port, server.pid) == ("server-1", 1, server.mark.pid)
-    assert server.target.control_port == 1
-    assert not left
-
-
 def test_an_announcement_of_another_pid_is_not_believed(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="announced pid"):
         with_server(tmp_path, FAKE % (1, ""), lambda made: made.wait_ready("server-1", SOON_S))
-
-
-def test_an_announcement_of_an_earlier_run_is_not_believed(tmp_path: Path) -> None:
-    (tmp_path / "server-1.json").write_text("{}")
-
-    with pytest.raises(ConfigurationError, match="was not ready within"):
-        with_server(
-            tmp_path, "import signal; signal.pause()", lambda made: made.wait_ready("server-1", AT_ONCE_S)
-        )
 
 
 def test_a_server_that_ends_shows_the_last_line_of_its_log(tmp_path: Path) -> None:
@@ -84,23 +66,3 @@ def test_a_server_that_ends_shows_the_last_line_of_its_log(tmp_path: Path) -> No
     with pytest.raises(ConfigurationError, match="exit code 1: no cheese today") as told:
         with_server(tmp_path, script, lambda made: made.wait_ready("server-1", SOON_S))
     assert str(tmp_path / "server-1.log") in told.value.hint
-
-
-@pytest.mark.parametrize("deaf", ["", "signal.signal(signal.SIGINT, signal.SIG_IGN)"])
-def test_a_server_that_does_not_leave_is_killed(tmp_path: Path, deaf: str) -> None:
-    async def work(made: LocalBackendServers) -> bool:
-        server = await made.wait_ready("server-1", SOON_S)
-        await made.stop(AT_ONCE_S if deaf else SOON_S)
-        return is_alive(server.mark)
-
-    alive, left = with_server(tmp_path, FAKE % (0, deaf), work)
-    assert not alive
-    assert not left
-
-
-def test_a_server_that_does_not_answer_has_no_status(tmp_path: Path) -> None:
-    async def work(made: LocalBackendServers) -> Any:
-        return await made.status(await made.wait_ready("server-1", SOON_S))
-
-    status, _ = with_server(tmp_path, FAKE % (0, ""), work)
-    assert status is None

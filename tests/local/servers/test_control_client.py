@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from rse_pf.errors import UsageError
 from rse_pf.local.servers.control_client import ControlPort
 
 SOON_S = 10.0
@@ -38,40 +37,6 @@ async def a_port(talk: Talk, token: str | None = None) -> AsyncIterator[ControlP
 
 def page(body: bytes, head: bytes = b"") -> bytes:
     return b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n%s\r\n%s" % (len(body), head, body)
-
-
-async def test_questions_share_one_connection() -> None:
-    connections = []
-
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        connections.append(writer)
-        while head := await reader.readuntil(b"\r\n\r\n"):
-            writer.write(page(b'{"asked": "%s"}' % head.split(b" ")[1]))
-
-    async with a_port(talk) as port:
-        told = [(await port.ask(target, timeout_s=SOON_S)).document() for target in ("/a", "/b")]
-
-    assert told == [{"asked": "/a"}, {"asked": "/b"}]
-    assert len(connections) == 1
-
-
-@pytest.mark.parametrize(
-    ("token", "carried"), [(None, []), ("ab" * 16, [f"authorization: bearer {'ab' * 16}"])]
-)
-async def test_every_question_carries_the_token(token: str | None, carried: list[str]) -> None:
-    heads: list[str] = []
-
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while head := await reader.readuntil(b"\r\n\r\n"):
-            heads.append(head.decode().lower())
-            writer.write(page(b"{}"))
-
-    async with a_port(talk, token) as port:
-        for target in ("/a", "/b"):
-            await port.ask(target, timeout_s=SOON_S)
-
-    told = [[line for line in head.split("\r\n") if line.startswith("authorization")] for head in heads]
-    assert told == [carried, carried]
 
 
 async def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_one() -> None:
@@ -110,16 +75,6 @@ async def test_whatever_is_no_answer_is_a_connection_error(answer: bytes) -> Non
             await port.ask("/a", timeout_s=SOON_S)
 
 
-async def test_a_port_where_nobody_listens_is_a_connection_error() -> None:
-    server = await asyncio.start_server(lambda reader, writer: None, "127.0.0.1", 0)
-    number = server.sockets[0].getsockname()[1]
-    server.close()
-    await server.wait_closed()
-
-    with pytest.raises(ConnectionError):
-        await ControlPort(number).ask("/a", timeout_s=SOON_S)
-
-
 async def test_events_are_followed_until_the_operation_is_over() -> None:
     heads: list[str] = []
 
@@ -133,20 +88,3 @@ async def test_events_are_followed_until_the_operation_is_over() -> None:
     assert events == ["a", "over"]
     assert heads[0].startswith("POST /drain?server=a HTTP/1.1\r\n")
     assert "Connection: close\r\n" in heads[0], "else a refusal would keep the connection, and the caller"
-
-
-async def test_a_refused_operation_says_why_and_a_silent_one_ends() -> None:
-    async def refuse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readuntil(b"\r\n\r\n")
-        writer.write(page(b'{"message": "no such server", "hint": "see the list"}\n').replace(b"200", b"409"))
-
-    async def say_nothing(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.read()
-
-    for talk, error, words in (
-        (refuse, UsageError, "no such server"),
-        (say_nothing, ConnectionError, "no answer"),
-    ):
-        async with a_port(talk) as port:
-            with pytest.raises(error, match=words):
-                await anext(port.follow("/drain", silence_s=AT_ONCE_S))

@@ -30,30 +30,6 @@ def standby(tmp_path: Path) -> Iterator[WarmStandby]:
     made.close()
 
 
-def test_the_standby_becomes_the_server_of_its_arguments(standby: WarmStandby, tmp_path: Path) -> None:
-    standby.warm()
-    waiting = standby.pid
-
-    process = standby.take(["serve", "--server-id", "server-3"], tmp_path / "server-3.log")
-
-    assert process is not None
-    assert process.wait(SOON_S) == 0
-    assert (tmp_path / "server-3.log").read_text() == f"serve --server-id server-3 {waiting}"
-    assert standby.pid is None
-
-
-def test_there_is_one_standby_and_it_is_taken_once(standby: WarmStandby, tmp_path: Path) -> None:
-    standby.warm()
-    first = standby.pid
-    standby.warm()
-
-    assert standby.pid == first
-    taken = standby.take(["serve"], tmp_path / "log")
-    assert taken is not None
-    assert standby.take(["serve"], tmp_path / "log") is None
-    taken.wait(SOON_S)
-
-
 def test_a_standby_that_died_is_not_taken(tmp_path: Path) -> None:
     standby = WarmStandby(tmp_path, dies_with_parent=True, program=(sys.executable, "-c", "pass"))
     assert standby.take(["serve"], tmp_path / "log") is None

@@ -54,27 +54,6 @@ class Box:
         return event
 
 
-async def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
-    box = Box(tmp_path, _PROGRAM)
-    await box.servers.start()
-    first = box.servers.state
-    assert first is not None
-    assert await box.next() == "data-server-up"
-
-    assert box.servers.process.send(9)  # type: ignore[arg-type]
-    assert [await box.next(), await box.next()] == ["data-server-down", "data-server-up"]
-    second = box.servers.process.mark
-    await box.servers.stop(10.0)
-
-    assert second is not None
-    assert second != first.process
-    assert not is_alive(first.process)
-    assert not is_alive(second)
-    assert box.servers.process.mark is None
-    assert (tmp_path / "starts").read_text() == "40001 dir:objects\n" * 2
-    assert not (tmp_path / "data-1.json").exists()
-
-
 async def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path: Path) -> None:
     earlier, later = Box(tmp_path, _PROGRAM), Box(tmp_path, _PROGRAM)
     await earlier.servers.start()
@@ -119,29 +98,6 @@ async def test_a_server_that_answers_nobody_is_ended_and_replaced(tmp_path: Path
     await box.servers.stop(10.0)
 
 
-async def test_a_platform_that_heals_nothing_only_tells_of_the_end(tmp_path: Path) -> None:
-    box = Box(tmp_path, _PROGRAM, replaces=False)
-    await box.servers.start()
-    assert await box.next() == "data-server-up"
-
-    assert box.servers.process.send(9)  # type: ignore[arg-type]
-    assert await box.next() == "data-server-down"
-    assert not box.servers.process.is_running()
-    await box.servers.stop(10.0)
-    assert (tmp_path / "starts").read_text().count("\n") == 1
-
-
-async def test_a_port_that_somebody_took_meanwhile_is_given_up(tmp_path: Path) -> None:
-    box = Box(tmp_path, _PROGRAM.replace("port = ", "args['--port'] == '0' or sys.exit('taken')\nport = "))
-
-    await box.servers.start(port=40002)
-    server = box.servers.state
-    assert server is not None
-
-    assert server.port == box.servers.port == 40001
-    await box.servers.stop(10.0)
-
-
 async def test_a_server_that_ends_at_once_is_told_with_its_last_words(tmp_path: Path) -> None:
     box = Box(tmp_path, "import sys; sys.exit('the disk is gone')")
 
@@ -149,23 +105,3 @@ async def test_a_server_that_ends_at_once_is_told_with_its_last_words(tmp_path: 
         await box.servers.start()
 
     box.servers.kill_all()
-
-
-async def test_a_server_that_stays_is_killed(tmp_path: Path) -> None:
-    stays = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\ntemporary = "
-    stubborn = _PROGRAM.replace("temporary = ", stays).replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
-    box = Box(tmp_path, stubborn)
-    await box.servers.start()
-    server = box.servers.state
-    assert server is not None
-
-    await box.servers.stop(0.2)
-
-    assert not is_alive(server.process)
-
-
-def test_nobody_is_ready_before_the_first_start(tmp_path: Path) -> None:
-    box = Box(tmp_path, _PROGRAM)
-
-    assert asyncio.run(box.servers.is_ready()) is False
-    assert box.servers.process.send(15) is False  # type: ignore[arg-type]

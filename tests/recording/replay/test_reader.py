@@ -14,7 +14,6 @@ from mcap.writer import CompressionType, Writer
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.extensions.recording import file_format, reader
 from rse_pf.extensions.recording.reader import open_recording
-from rse_pf.extensions.recording.summary import Wanted
 from rse_pf.wire import Command, Failure, Result
 from tests.kit.recorded_sessions import START_NS, Made, jpeg
 
@@ -53,31 +52,6 @@ def test_an_earlier_message_that_ends_many_commands_is_a_failure_of_each(tmp_pat
         Failure(id=number, code="busy", message="too many", retry_after_ms=20.0) for number in (0, 1)
     ]
     assert commands[0].answered_ns == commands[1].answered_ns
-
-
-def test_an_answer_in_the_next_file_is_found(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a", max_file_bytes=1)
-    sent = [made.send(seed) for seed in range(3)]
-    assert len(list(made.close().glob("*.mcap"))) == 3
-
-    assert [each.id for each in open_recording(tmp_path / "a").commands() if each.reply_bytes] == sent
-
-
-def test_files_of_two_servers_are_read_by_their_times(tmp_path: Path) -> None:
-    first, second = (
-        Made(tmp_path / "a"),
-        Made(tmp_path / "a", server="server-2", start_ns=START_NS + 300_000_000),
-    )
-    for seed in range(4):
-        first.send(seed, robot=1)
-        second.send(seed, robot=2)
-    first.close()
-    second.close()
-
-    times = [each.sent_ns for each in open_recording(tmp_path / "a").commands()]
-
-    assert times == sorted(times)
-    assert len(times) == 8
 
 
 def test_a_thumbnail_and_odometry_belong_to_the_command_that_was_sent_next(tmp_path: Path) -> None:
@@ -198,28 +172,6 @@ def test_what_is_no_recording_is_told_in_one_line(
     assert "\n" not in error.value.message
 
 
-def test_a_file_that_was_never_begun_does_not_end_the_others(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    made.send(1)
-    (made.close() / "20200101T000000Z-server-0-0001.mcap").write_bytes(b"")
-
-    recording = open_recording(tmp_path / "a")
-
-    assert len(list(recording.commands())) == 1
-    assert len(recording.cut) == 1
-
-
-def test_a_command_is_found_by_the_end_of_its_name_if_that_is_clear(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    names = [made.send(seed, robot=seed) for seed in range(3)]
-    recording = open_recording(made.close())
-
-    assert recording.find(names[1]).id == names[1]
-    assert recording.find("1").id == names[1]
-    with pytest.raises(BadRequest, match="no command '9'"):
-        recording.find("9")
-
-
 @pytest.mark.parametrize("is_finished", [True, False])
 def test_a_command_is_found_without_opening_the_chunks_of_other_robots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_finished: bool
@@ -254,21 +206,6 @@ def test_a_command_is_found_without_opening_the_chunks_of_other_robots(
     assert (len(opened) < every / 2) == is_finished
     with pytest.raises(BadRequest, match="no command"):
         recording.find(f"{names[50].partition(':')[0]}:7")
-
-
-def test_what_is_asked_of_a_time_is_read_and_little_else(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    names = [made.send(seed, robot=seed % 3) for seed in range(60)]
-    recording = open_recording(made.close())
-    every = list(recording.commands())
-    asked = every[30]
-
-    found = [
-        each.id for each in recording.commands(Wanted(begin_ns=asked.sent_ns, end_ns=asked.answered_ns or 0))
-    ]
-
-    assert asked.id in found
-    assert len(found) < 10 < len(every) == len(names)
 
 
 def _without_checksums(path: Path) -> Path:

@@ -14,7 +14,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest
 from rse_pf.extensions.recording.reader import RecordedCommand, open_recording
 from rse_pf.extensions.recording.replay import run
-from rse_pf.extensions.recording.replay.solving import TIMES_AND_PLACES, Overrides, Resolver, pnp_reply
+from rse_pf.extensions.recording.replay.solving import Overrides, Resolver, pnp_reply
 from rse_pf.geometry import exp_se3, transform
 from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
 from rse_pf.wire import Failure, Result, make_codec
@@ -61,38 +61,6 @@ def test_the_smallest_change_of_an_answer_is_noticed(tmp_path: Path) -> None:
     assert resolver.again(command).is_equal
     assert not resolver.again(changed(command, T_camera_world=pose)).is_equal
     assert "weak" in resolver.again(changed(command, verdict="weak", reason="few-inliers")).difference
-
-
-def test_times_and_places_may_differ(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    made.send(1, codec="json")
-    (command,) = open_recording(made.close()).commands()
-    reply = command.reply
-    assert isinstance(reply, Result)
-    numbers = {"queue_ms": 7.5, "compute_ms": 0.25, "received_s": 1e5, "sent_s": 2e5, "server": "another"}
-    assert set(numbers) < set(TIMES_AND_PLACES)
-
-    data = make_codec("json").encode(msgspec.structs.replace(reply, **numbers))
-    elsewhere = dataclasses.replace(command, reply_bytes=data)
-
-    assert Resolver().again(elsewhere).is_equal
-
-
-def test_what_a_server_refused_or_never_answered_is_not_solved_again(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    made.send(1, answer=Failure(id=0, code="busy", message="wait"))
-    made.send(2, is_answered=False)
-    made.send(3, service="warehouse")
-    made.send(4)
-
-    seen = run.overview(made.close(), SETTINGS, solve=True)
-
-    assert (seen.commands, seen.equal, seen.different) == (4, 1, 0)
-    assert seen.not_solved == {
-        "the server did not solve it: busy": 1,
-        "no answer was recorded": 1,
-        "its service is installed on the server": 1,
-    }
 
 
 def test_other_options_are_tried_and_said(tmp_path: Path) -> None:
