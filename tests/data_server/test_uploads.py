@@ -73,6 +73,13 @@ def test_wrong_bytes_never_become_an_object_and_are_removed(service: Service) ->
     assert service.ask("GET", UPLOAD).status == 404
 
 
+def test_more_bytes_than_announced_are_refused(service: Service) -> None:
+    begin(service, 100)
+
+    assert part(service, 0, 101).status == 400
+    assert begin(service, 200).status == 409
+
+
 def test_parts_are_not_flushed_to_the_disk_but_the_object_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

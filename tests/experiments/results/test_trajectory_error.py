@@ -45,6 +45,15 @@ def test_a_known_error_is_measured():
     assert accuracy(estimate, truth).ate_max_m == pytest.approx(0.1)
 
 
+def test_the_alignment_is_a_rotation_even_for_mirrored_points():
+    points = np.random.default_rng(3).normal(size=(20, 3))
+
+    _, pose = align(points, points * [1, 1, -1])
+
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-12)
+
+
 def test_poses_are_matched_by_time_and_not_by_row():
     truth = wander(4, 40)
     estimate = Trajectory(truth.timestamps_s[5:35:3] + 0.001, truth.T_world_camera[5:35:3])
