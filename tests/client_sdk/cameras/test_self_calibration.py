@@ -15,8 +15,8 @@ from client_sdk.rigs.rig_file import read_intrinsics
 from client_sdk.simulator.drive import true_trajectory
 from client_sdk.simulator.renderer import Renderer
 from client_sdk.simulator.world import make_world
-from rse_pf.cli import extras
 from rse_pf.cli.main import main
+from rse_pf.command_line import extras
 from rse_pf.errors import CommandFailed
 from rse_pf.geometry import Array, Camera, exp_se3
 
