@@ -26,31 +26,6 @@ class Bench:
         self.messages.append(robots)
 
 
-def test_events_of_ten_milliseconds_are_one_message() -> None:
-    bench = Bench()
-
-    for number in range(3):
-        bench.events.add(event="arrived", number=number)
-        bench.loop.advance(0.003)
-    assert bench.messages == []
-    bench.loop.advance(0.0011)
-
-    assert bench.messages == [[{"event": "arrived", "number": number} for number in range(3)]]
-
-
-def test_a_later_event_waits_for_its_own_ten_milliseconds() -> None:
-    bench = Bench()
-
-    bench.events.add(number=1)
-    bench.loop.advance(0.02)
-    bench.events.add(number=2)
-    bench.loop.advance(0.009)
-    assert bench.messages == [[{"number": 1}]]
-    bench.loop.advance(0.002)
-
-    assert bench.messages == [[{"number": 1}], [{"number": 2}]]
-
-
 def test_no_message_is_longer_than_the_line_that_the_supervisor_reads() -> None:
     bench = Bench()
     robot = ["t" * 64, "r" * 64, ""]
@@ -62,16 +37,6 @@ def test_no_message_is_longer_than_the_line_that_the_supervisor_reads() -> None:
     assert [len(message) for message in bench.messages] == [500, 500, 201]
     assert [event["number"] for message in bench.messages for event in message] == list(range(1201))
     assert all(len(repr(message)) < LINE_BYTES for message in bench.messages)
-
-
-def test_what_is_held_is_sent_before_the_worker_ends() -> None:
-    bench = Bench()
-
-    bench.events.add(event="left", number=1)
-    bench.events.flush()
-    bench.loop.advance(1.0)
-
-    assert bench.messages == [[{"event": "left", "number": 1}]], "once, although its timer was set"
 
 
 def connection(name: str, tenant: str = "default", **changed: Any) -> Any:
