@@ -52,7 +52,7 @@ class Wire(Protocol):
 
 
 class CrashMarks(Protocol):
-    """Where a worker notes for whom it computes; `rse_pf.server.supervisor.crash_report` reads it."""
+    """Notes of a worker for which robot it computes; `rse_pf.server.supervisor.crash_report` has them."""
 
     of_loop: memoryview
     """The connection for which the thread of the event loop works, in its only element; 0 for none."""
@@ -68,7 +68,7 @@ class CrashMarks(Protocol):
 
 
 class NoCrashMarks:
-    """The marks of a process that nobody replaces."""
+    """Notes of nothing, for a process that is not replaced after a crash."""
 
     def __init__(self) -> None:
         self.of_loop = memoryview(bytearray(8)).cast("Q")
@@ -187,9 +187,9 @@ class NullServerRecorder:
 
 
 class Subscriber(Protocol):
-    """A robot's connection, as topics and live maps use it, which the gateway stands above.
+    """The connection of a robot that has subscriptions, as live maps use it.
 
-    Messages are written only as fast as its other end reads them.
+    Messages are written only as fast as the robot reads them.
     """
 
     is_connected: bool
@@ -199,7 +199,7 @@ class Subscriber(Protocol):
 
     @property
     def unsent_bytes(self) -> int:
-        """How much was written that the kernel has not taken."""
+        """Bytes that were written and that the kernel has not taken."""
 
     def bound_unsent(self, max_bytes: int) -> None:
         """Limit the bytes that the kernel holds for the network to *max_bytes*."""
@@ -212,7 +212,7 @@ class Subscriber(Protocol):
 
 
 class Log(Protocol):
-    """Where events go; `rse_pf.server.log.JsonLog` is one."""
+    """Log of events, such as `rse_pf.server.log.JsonLog`."""
 
     def info(self, event: str, **fields: Any) -> None:
         """Write an event of normal operation."""
@@ -226,7 +226,7 @@ class Log(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clocks:
-    """The clocks of a worker: monotonic s, Unix s, and CPU s of the process."""
+    """The clocks of a worker, in seconds: monotonic time, Unix time, and CPU time of the process."""
 
     monotonic: Callable[[], float]
     wall: Callable[[], float]
@@ -250,7 +250,7 @@ class WorkerContext:
         log: The log of the worker.
         metrics: The counters of the worker.
         tap: Observes the messages of all connections, for a recording.
-        crash: Knows for whom this process computes, if it crashes.
+        crash: Notes for which robot this process computes, in case it crashes.
         new_session_id: Makes the id of a session, which goes into its welcome.
     """
 

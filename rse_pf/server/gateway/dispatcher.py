@@ -57,11 +57,11 @@ _BAD_MESSAGE_PAUSE_S = 0.1
 # Bad messages with a readable id that count for the pause: clients take 1 s of silence for a lost connection.
 _MAX_REFUSED = 5
 _NO_JOBS = {"jobs": 0.0, "jobs_pending": 0.0}
-"""Alarms read these gauges of every server."""
+"""Gauges that alarms read of every server, also of one without jobs."""
 
 
 class Dispatcher:
-    """All connections of one worker and the commands that they sent."""
+    """The connections of one worker: receives their messages, and submits their commands to queues."""
 
     def __init__(
         self,
@@ -77,10 +77,10 @@ class Dispatcher:
         Args:
             context: The settings, clocks, event loop and log of the worker.
             answers: Computes and sends answers; its registry names the services of this process.
-            token_watch: Ends connections whose token is no longer valid; the connections are shared with it.
-            queues: Where commands wait, beside that of stateless services; the first that offers a service
-                takes its commands.
-            updates: Takes subscriptions to live maps; one of *queues*, or None where they are off.
+            token_watch: Closes connections whose token is no longer valid; shares its set of connections.
+            queues: Queues of commands, in addition to that of stateless services; the first that offers a
+                service takes its commands.
+            updates: Takes subscriptions to live maps; one of *queues*, or None if live maps are off.
         """
         settings = context.settings
         self.context = context
@@ -111,11 +111,11 @@ class Dispatcher:
 
     @property
     def held(self) -> int:
-        """Commands that must be answered before the worker ends."""
+        """Commands that must be answered before the worker exits."""
         return sum(queue.held for queue in self._queues)
 
     def connect(self, wire: Wire, accepted: Accepted, number: int = 0) -> RobotConnection:
-        """Return a new connection for a robot whose handshake is done; *number* says which socket it is."""
+        """Return a new connection for an accepted handshake; *number* is the number of its socket."""
         now = self.context.clocks.monotonic()
         expires_s = (
             None if accepted.expires_s is None else now + accepted.expires_s - self.context.clocks.wall()
@@ -161,7 +161,7 @@ class Dispatcher:
             self.context.log.info("robot-offline", robot=connection.robot)
 
     def _greet(self, connection: RobotConnection, now: float) -> None:
-        """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
+        """Report that a robot said Hello; if the server drains, ask it to move to another one at once."""
         if connection.is_shown:
             self.context.log.info("robot-online", robot=connection.robot)
         self._token_watch.report_hello(connection)
@@ -169,7 +169,7 @@ class Dispatcher:
             connection.move(*self._move, now)
 
     def move_all(self, reason: str, within_ms: float) -> None:
-        """Ask every robot, now and from now on, to leave for another server."""
+        """Ask every robot to move to another server, also those that connect from now on."""
         self._move = (reason, within_ms)
         for queue in self._queues:
             queue.give_up()
@@ -178,7 +178,7 @@ class Dispatcher:
             connection.move(reason, within_ms, now)
 
     def close_all(self) -> None:
-        """Close every socket; what is held is lost, so wait for `held` to be 0 first."""
+        """Close every socket; commands that are held stay unanswered, so wait until `held` is 0 before."""
         for connection in list(self.connections):
             connection.close(CLOSE_GOING_AWAY, "leaving")
         self.decoder.close()
@@ -209,9 +209,10 @@ class Dispatcher:
     def _refuse_unread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> bool:
-        """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
+        """Refuse the message *data* for a fraction of the cost of decoding; False if it must be decoded."""
         answers = self._answers
         codec = session.codec
+        # 1. The rate of the robot.
         retry_ms = self.rates.retry_after_ms(connection.robot, now)
         if retry_ms == CUT_OFF:
             self.context.metrics.shed["rate"] += 1
@@ -221,11 +222,13 @@ class Dispatcher:
         if retry_ms:
             answers.refuse_unread(connection, peek(codec, data), len(data), TOO_FAST, retry_ms)
             return True
+        # 2. The backlog of the server, or the rest of a pause; a robot that ignores pauses is not refused.
         scheduler = self.stateless.scheduler
         if connection.ignores_pauses or not scheduler.waiting:
             return False
         early_s = max(0.0, connection.paused_until_s - now)
         pause_s = early_s or scheduler.unread_pause_s(connection.robot, connection.allowed_s)
+        # 3. Only commands for the queue that is behind are refused; their id and service are read for that.
         envelope = peek(codec, data) if pause_s else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
@@ -336,7 +339,7 @@ class Dispatcher:
             connection.refuse_updates(identity, error)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the numbers of this worker for /metrics and /status."""
+        """Return the metrics of this worker for /metrics and /status."""
         reports = [queue.report() for queue in self._queues]
         metrics = self.context.metrics
         gauges = {

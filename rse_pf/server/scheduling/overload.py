@@ -2,7 +2,7 @@
 
 The rule is random early detection (RED) with the expected wait in place of the mean queue length:
 
-1. The expected wait is the position in the queue multiplied by the mean wait for each position.
+1. The expected wait is the number of commands ahead in the queue, times the mean wait for each position.
 2. Below `MIN_WAIT_SHARE` of the time until its deadline, a command is accepted.
 3. From there the refused share grows linearly to 1 at the maximum wait, so that the length of the queue
    settles; with a fixed threshold it would oscillate.  The maximum is `MAX_WAIT_SHARE` of the time until the

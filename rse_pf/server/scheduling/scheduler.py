@@ -2,8 +2,8 @@
 
 - Order: fair between tenants, then between the robots of a tenant (`FairQueue`).  At most one command of a
   robot runs at a time.
-- Streams: the newest frame of a stream replaces the one that waits, and inherits its position, unless the
-  waiting frame was sent with ``keep``.
+- Streams: the newest frame of a stream replaces the one that waits, and inherits its position, unless one of
+  them was sent with ``keep``.
 - Deadlines: a command whose deadline has passed never runs.
 - Overload: `OverloadControl` decides from the expected wait which commands are refused.
 
