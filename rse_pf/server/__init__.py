@@ -1,5 +1,5 @@
 """A backend server, in packages from the supervisor and the gateway to sandboxes, jobs and live maps.
 
-Here is what they share: ports, log, metrics, quota and references to stored objects. The entry is
-`rse_pf.server.supervisor.serve`.
+The modules here are shared by these packages: values of a worker, log, metrics, quotas, and references to
+stored objects.  The entry point is `rse_pf.server.supervisor.serve`.
 """

@@ -1,5 +1,5 @@
-"""Long commands of robots: leases in the store, processes, and their turn on a server.
+"""Long commands of robots as jobs: leases in the store, processes, and slots of a server.
 
-What a job computes belongs to `rse_pf.services`; anything that answers within a frame belongs to
-`scheduling`.  What operators compute in parts belongs to `rse_pf.extensions.batch`.
+The services that jobs run belong to `rse_pf.services`; services that answer within a frame belong to
+`scheduling`. Merges that operators distribute over several machines belong to `rse_pf.extensions.batch`.
 """

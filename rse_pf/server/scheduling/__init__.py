@@ -1,4 +1,4 @@
-"""Which command runs next, and in which thread.
+"""The order in which commands are computed, and the event loop and threads that share the work.
 
-Queues and executors belong here; what a command does, and its answer on the wire, do not.
+Schedulers and queues belong here; the computation of a command, and its answer on the wire, do not.
 """

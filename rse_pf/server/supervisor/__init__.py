@@ -1,6 +1,6 @@
-"""The server's main process: listener, worker processes, control port.
+"""The main process of a server: listener, worker processes and control port.
 
-Processes and their life belong here; a robot's messages belong to `gateway`.
+The start, replacement and end of processes belong here; messages of robots belong to `gateway`.
 """
 
 from rse_pf.server.supervisor.supervisor import serve
