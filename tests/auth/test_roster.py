@@ -19,8 +19,9 @@ from rse_pf.auth.roster import (
     key_id_of,
     public_key_of,
     scopes_allow,
+    to_json,
 )
-from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
+from rse_pf.auth.tokens import Claims, KeySet, SigningKey, claims_problem, token_problem, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 
@@ -56,6 +57,10 @@ def problem(text: str, keys: KeySet, now: float = NOW_S) -> str:
     return token_problem(caught.value)
 
 
+def test_a_robots_key_signs_for_no_other_robot():
+    assert problem(token(robot="robot-2"), trusted()) == "wrong-robot"
+
+
 def test_a_robots_key_id_cannot_name_a_key_of_the_platform():
     forger = SigningKey.from_seed(b"f" * 32, ROBOT.key_id)
     keys = KeySet.from_json(forger.key_set().to_json()).with_access_control(Roster(), DenyList())
@@ -68,6 +73,22 @@ def test_the_key_id_is_the_thumbprint_of_rfc_7638():
     x = "11qYAYKxCrfVS_7TyWQHO" + "g7hcvPapiMlrwIaaPcHURo"
 
     assert key_id_of(x) == "robot:kPrK_qmxVWaYVA9wwBF6Iuo3vVzz7TxHCTwXBygrS4k"
+
+
+@pytest.mark.parametrize(
+    ("denied", "reason"),
+    [
+        (DenyList().with_robot("lab", "robot-1", 0.0), "disabled"),
+        (DenyList().with_token("lab", "robot-1", "t", NOW_S + 900), "revoked"),
+        (DenyList().with_tokens_before("lab", "robot-1", NOW_S + 1), "issued-too-early"),
+    ],
+)
+def test_denied_tokens_are_refused_and_end_their_connections(denied: DenyList, reason: str):
+    claims = verified(token(), trusted())
+
+    assert problem(token(), trusted(denied)) == reason
+    assert claims_problem(claims, trusted()) == ""
+    assert claims_problem(claims, trusted(denied)) == reason
 
 
 @pytest.mark.parametrize(
@@ -94,12 +115,25 @@ def test_pruning_removes_only_entries_about_expired_tokens():
     assert (later.tokens, later.not_before, later.disabled) == ((), (), denied.disabled)
 
 
+def test_a_later_revocation_keeps_an_earlier_one():
+    denied = DenyList().with_tokens_before("d", "r", 500.0).with_tokens_before("d", "r", 400.0)
+
+    assert [each.at_s for each in denied.not_before] == [500.0]
+
+
 def test_a_name_has_one_key_and_a_key_one_name():
     fresh = EnrolledRobot(robot="robot-1", tenant="lab", x="A" * 43)
 
     assert ROSTER.enrolled(fresh).robots == (fresh,)
     with pytest.raises(UsageError, match="has this key already"):
         ROSTER.enrolled(EnrolledRobot(robot="robot-2", tenant="lab", x=ENROLLED.x))
+
+
+def test_both_survive_their_json():
+    denied = DenyList().with_token("d", "r", "t", 9.0).with_robot("d", "s", 1.0)
+
+    assert from_json(to_json(ROSTER), Roster) == ROSTER
+    assert from_json(to_json(denied), DenyList) == denied
 
 
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))

@@ -14,10 +14,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rse_pf.auth import tokens
-from rse_pf.auth.roster import DenyList, Roster
+from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster
 from rse_pf.auth.tokens import KeySet, SigningKey, token_problem, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
+
+ROBOT_KEY = SigningKey.of_robot(bytes(range(2, 34)))
+ENROLLED = EnrolledRobot(robot="robot-7", x=json.loads(ROBOT_KEY.public_json())["x"])
 
 NOW = 1_790_000_000.0
 SETTINGS = AuthSettings()
@@ -195,6 +198,13 @@ def test_the_leeway_is_kept_to_the_second() -> None:
     assert refused(token, now=NOW - 1 - SETTINGS.leeway_s) == "not-yet-valid"
 
 
+def test_not_before_has_the_same_leeway() -> None:
+    token = sign({**GOOD, "nbf": NOW + SETTINGS.leeway_s})
+
+    assert verify_token(token, keys=KEYS, now=NOW, settings=SETTINGS).robot.name == "robot-7"
+    assert refused(token, now=NOW - 1) == "not-yet-valid"
+
+
 @pytest.mark.parametrize("ttl_s", [0.0, -1.0, SETTINGS.token_ttl_s + 1.0, float("nan"), float("inf")])
 def test_a_ttl_outside_the_settings_is_not_issued(ttl_s: float) -> None:
     with pytest.raises(UsageError, match="a time to live of"):
@@ -256,6 +266,14 @@ def test_the_times_of_a_verified_token_are_judged_every_time():
         assert token_problem(caught.value) == reason
 
 
+def test_a_verified_token_counts_for_the_issuer_and_the_audience_that_it_was_verified_for():
+    keys, token = trusted(), issue()
+    verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+
+    with pytest.raises(Unauthorized):
+        verify_token(token, keys=keys, now=NOW, settings=AuthSettings(audience="another"))
+
+
 def test_another_roster_or_deny_list_remembers_no_token():
     token = issue()
     verify_token(token, keys=(keys := trusted()), now=NOW, settings=SETTINGS)
@@ -264,6 +282,17 @@ def test_another_roster_or_deny_list_remembers_no_token():
     with pytest.raises(Unauthorized) as caught:
         verify_token(token, keys=keys.with_access_control(Roster(), denied), now=NOW, settings=SETTINGS)
     assert token_problem(caught.value) == "revoked"
+
+
+def test_tokens_that_are_refused_are_not_remembered():
+    keys = trusted(Roster(robots=(ENROLLED,)))
+    wrong = ROBOT_KEY.issue("robot-8", now=NOW, token_id="t", settings=SETTINGS)
+    for token in (wrong, sign(GOOD, key=OTHER), issue()[:-4] + "AAAA"):
+        for _ in range(2):
+            with pytest.raises(Unauthorized):
+                verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+
+    assert (len(keys._signed), len(keys._digests)) == (0, 0)
 
 
 def test_a_robot_has_one_place_among_the_remembered_tokens_and_their_number_is_bounded(monkeypatch):

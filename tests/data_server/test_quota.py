@@ -143,6 +143,27 @@ def test_how_many_versions_stay_is_a_number_above_zero(service: Service, query: 
     assert len(service.ask("GET", VERSIONS).json) == 1
 
 
+def test_another_tenant_removes_nothing(service: Service) -> None:
+    first = commit(service, 1, None)
+    commit(service, 2, first.json["id"])
+
+    assert service.ask("DELETE", VERSIONS, query="keep=1", tenant="rival").status == 404
+    assert len(service.ask("GET", VERSIONS).json) == 2
+
+
+def test_a_refused_commit_charges_nothing(service: Service) -> None:
+    first = commit(service, 1, None)
+    before = [info.name for info in service.store.list("charges/")]
+
+    assert commit(service, 2, None).status == 409
+    assert commit(service, 3, "0" * 64).status == 409, "it may have been removed"
+
+    assert first.status == 201
+    assert [info.name for info in service.store.list("charges/")] == before
+    (name,) = before
+    assert name == f"charges/default/robot-1/kitchen/{first.json['id']}.{first.json['record']['size']}"
+
+
 def test_a_commit_that_finds_the_disk_full_charges_nothing() -> None:
     service = Service(small_settings(), FakeStore(fail_with(StoreFull("no space"), "put", part="maps/")))
 

@@ -26,6 +26,8 @@ from rse_pf.limits.budget import (
 )
 from rse_pf.wire import Command, make_codec
 
+SHORT_NUMBERS = ("0.00012345678901234567", "-1.2345678901234567e-05", "1" * 19, "5e-99", "0." + "0" * 60)
+
 SMALL = replace(Budget.of_messages(SessionSettings()), values=64, mixed_values=64, containers=16)
 
 
@@ -113,6 +115,11 @@ def test_few_numbers_may_have_more_than_19_digits(number):
     assert is_within('["' + numbers(1000) + '", "' + "x" * 9000 + '"]'), "it is a text"
 
 
+@pytest.mark.parametrize("number", SHORT_NUMBERS)
+def test_many_numbers_may_have_19_digits(number):
+    assert is_within("[" + f"{number}," * 10_000 + "1]")
+
+
 @pytest.mark.parametrize("number", ["5e-324", "1.7E308", "0.1e+0100"])
 def test_few_numbers_may_have_an_exponent_of_three_digits(number):
     assert is_within("[" + f"{number}," * 199 + number + "]")
@@ -180,6 +187,18 @@ def test_inflating_refuses_what_is_not_one_stream():
             inflate_within(wrong, WIDE)
     with pytest.raises(LimitExceeded):
         inflate_within(zlib.compress(np.random.default_rng(1).bytes((1 << 20) + 1)), WIDE)
+
+
+def test_bytes_that_deflate_well_are_refused_by_their_ratio_behind_others_that_do_not():
+    noise = np.random.default_rng(3).bytes(1500)
+    for zeros, is_allowed in ((25_000, True), (40_000, False), (1 << 19, False)):
+        data = zlib.compress(noise + bytes(zeros), 9)
+        assert (len(noise) + zeros <= len(data) * WIDE.inflate_ratio) == is_allowed
+        if is_allowed:
+            assert inflate_within(data, WIDE) == noise + bytes(zeros)
+            continue
+        with pytest.raises(LimitExceeded):
+            inflate_within(data, WIDE)
 
 
 def test_bytes_after_a_stream_are_seen_wherever_it_ends():

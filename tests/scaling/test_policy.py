@@ -32,6 +32,10 @@ def test_shrinks_only_after_five_uninterrupted_idle_minutes() -> None:
     assert actions(0, 0, 0, 30, 0, 0, 0, 0) == ["stay"] * 8
 
 
+def test_a_quiet_fleet_that_still_gets_requests_is_not_idle() -> None:
+    assert actions(0, 0, 0, 0, 0, 0, requests=1.0) == ["stay"] * 6
+
+
 def test_grows_at_the_second_busy_minute_and_the_threshold_counts_as_busy() -> None:
     assert actions(70, 70) == ["stay", "grow"]
     assert actions(69.9, 70) == ["stay", "stay"]
@@ -40,6 +44,10 @@ def test_grows_at_the_second_busy_minute_and_the_threshold_counts_as_busy() -> N
 def test_servers_that_warm_up_count_as_added_already() -> None:
     assert last(90, 90, fleet=FleetState(servers=4, warming=1)).servers == 1
     assert last(90, 90, fleet=FleetState(servers=5, warming=2)).kind == "stay"
+
+
+def test_nothing_shrinks_while_a_server_warms_up() -> None:
+    assert last(0, 0, 0, 0, 0, fleet=FleetState(servers=4, warming=1)).kind == "stay"
 
 
 def test_never_leaves_the_bounds() -> None:

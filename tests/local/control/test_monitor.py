@@ -51,6 +51,13 @@ def test_cpu_is_relative_to_the_size_and_to_the_time_between_two_answers() -> No
     assert told.cpu_percent == 50.0
 
 
+def test_the_mean_leaves_out_who_warms_up_and_who_does_not_answer() -> None:
+    servers = [server("a", 80.0), server("b", 40.0), server("c", 0.0, warming=True), server("d", None)]
+
+    assert monitor_sample(1.0, servers, frozenset()).cpu_percent == 60.0
+    assert monitor_sample(1.0, servers[2:], frozenset()).cpu_percent is None
+
+
 def test_a_sample_is_the_mean_over_time_of_one_period_and_the_sum_of_its_requests() -> None:
     periods = Periods(10.0, keep=4)
     over = [

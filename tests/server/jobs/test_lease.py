@@ -62,6 +62,34 @@ def test_the_verdict_follows_from_the_record(record, unchanged_s, is_watched, ex
     assert found == expected
 
 
+def test_of_two_processes_that_take_a_job_one_succeeds(store, clock):
+    one, other = looked(store, "one", clock), looked(store, "other", clock)
+
+    assert [one.take(), other.take()] == [True, False]
+    assert (one.is_ours, other.is_ours) == (True, False)
+    assert verdict(other) == "follow"
+
+
+def test_an_owner_that_renews_keeps_the_job_and_one_that_does_not_loses_it(store, clock):
+    one, other = looked(store, "one", clock), looked(store, "other", clock)
+    one.take()
+    for _ in range(20):
+        clock.now += LEASE_S - 0.1
+        assert one.renew(0.5, "half")
+        assert verdict(other) == "follow"
+    assert other.record is not None
+    assert (other.record.share, other.record.what) == (0.5, "half")
+
+    clock.now += LEASE_S
+    assert verdict(other) == "take"
+    assert other.take()
+
+    assert not one.renew(0.6, "late")
+    assert not one.is_ours
+    assert not one.end(JobRecord(state="done", owner="", reply="cd"))
+    assert verdict(one) == "follow"
+
+
 def test_a_process_that_reads_a_record_for_the_first_time_waits_a_whole_lease(store, clock):
     looked(store, "one", clock).take()
     clock.now += 1000.0

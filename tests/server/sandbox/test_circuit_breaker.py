@@ -9,7 +9,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, WorkerLost
 from rse_pf.identity import RobotId
-from rse_pf.server.sandbox.circuit_breaker import CircuitBreaker
+from rse_pf.server.sandbox.circuit_breaker import POISON_S, CircuitBreaker
 
 SETTINGS = PlatformSettings.from_dict({"services": {"breaker_crashes": 3}}).services
 ONE, TWO, THREE, FOUR = (RobotId("acme", f"robot-{i}") for i in range(1, 5))
@@ -50,6 +50,15 @@ def test_a_request_that_crashed_twice_is_poison_for_its_robot_alone():
 
     assert refused(breaker, ONE, TWO, NAMESAKE, digest="a", now=200.0) == ["poison", "", ""]
     assert refused(breaker, ONE, digest="b", now=200.0) == [""]
+
+
+def test_a_poison_request_is_tried_again_ten_minutes_after_its_crashes():
+    breaker = crashing([ONE, ONE], apart_s=0.0, digest="a")
+
+    assert refused(breaker, ONE, digest="a", now=POISON_S - 0.1) == ["poison"]
+    assert refused(breaker, ONE, digest="a", now=POISON_S) == [""]
+    breaker.note_crash(ONE, "icp", "a", POISON_S)
+    assert refused(breaker, ONE, digest="a", now=POISON_S) == [""], "one new crash is not enough"
 
 
 def test_three_crashes_in_half_a_minute_open_the_breaker_of_a_service_for_a_minute():
@@ -136,6 +145,17 @@ def test_a_name_that_was_enrolled_again_has_nothing_of_its_predecessor():
     breaker = crashing([RobotId("acme", "robot-1", "old")] * 3)
 
     assert refused(breaker, RobotId("acme", "robot-1", "new")) == [""]
+
+
+def test_an_operator_lifts_everything_and_the_evidence_is_forgotten():
+    breaker = crashing([ONE, TWO, THREE, ONE, TWO, THREE], digest="a")
+    lifted = breaker.unblock(1.0)
+
+    assert {(block.reason, block.robot) for block in lifted} >= {("crashes", None), ("poison", "robot-1")}
+    assert breaker.blocks(1.0) == []
+    assert refused(breaker, ONE, digest="a") == [""]
+    breaker.note_crash(ONE, "icp", "a", 1.0)
+    assert refused(breaker, ONE, TWO, digest="a") == ["", ""]
 
 
 # --- the operator ----------------------------------------------------------------------------------

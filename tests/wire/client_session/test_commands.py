@@ -102,6 +102,16 @@ def test_an_older_answer_than_the_last_delivered_one_is_stale():
     assert codes(tell(session, connection, result(older), 0.2)) == {older.id: "stale"}
 
 
+def test_an_unanswered_command_expires_at_its_deadline_and_not_before():
+    session = make_session()
+    open_connection(session)
+    identity = session.submit("pnp", None, now=0.0, deadline_s=0.5)
+
+    assert session.due(0.499) == []
+    assert codes(session.due(0.5)) == {identity: "expired"}
+    assert session.next_due(0.0) <= 0.5
+
+
 def test_a_robot_sends_no_more_commands_than_the_server_accepts():
     session = make_session()
     connection = open_connection(session, room=2)
@@ -128,6 +138,27 @@ def test_busy_is_retried_after_the_servers_pause():
     session.due(0.31)
 
     assert [again.id for again in commands(connection)] == [command.id]
+
+
+def test_a_new_connection_respects_the_pause_of_a_busy_answer():
+    session = make_session()
+    connection = open_connection(session)
+    session.submit("pnp", None, now=0.0)
+    (command,) = commands(connection)
+    tell(session, connection, failure(command, "busy", retry_after_ms=500), 0.0)
+
+    assert commands(open_connection(session, now=0.1, server="b")) == []
+
+
+def test_busy_beyond_the_deadline_is_final():
+    session = make_session()
+    connection = open_connection(session)
+    session.submit("pnp", None, now=0.0, deadline_s=0.2)
+    (command,) = commands(connection)
+
+    events = tell(session, connection, failure(command, "busy", retry_after_ms=200), 0.1)
+
+    assert codes(events) == {command.id: "busy"}
 
 
 def test_retries_after_busy_stay_within_their_budget():

@@ -20,6 +20,14 @@ def judged(rates: RobotRates, per_s: float, seconds: float, robot: tuple[str, st
     return [rates.retry_after_ms(robot, 100.0 + k / per_s) for k in range(int(per_s * seconds))]
 
 
+def test_a_bucket_gives_its_burst_then_its_rate():
+    bucket = TokenBucket(10.0, 3.0)
+
+    assert [bucket.take(5.0) for _ in range(3)] == [0.0, 0.0, 0.0]
+    assert bucket.take(5.0) == pytest.approx(0.1)
+    assert bucket.take(5.1) == pytest.approx(0.0, abs=1e-9)
+
+
 @given(
     gaps=st.lists(st.floats(0.0, 2.0), min_size=1, max_size=200),
     rate=st.floats(0.5, 50.0),
@@ -35,6 +43,14 @@ def test_no_span_of_time_gives_more_than_burst_and_rate_together(gaps, rate, bur
     for first, begin in enumerate(taken):
         for count, end in enumerate(taken[first:], start=1):
             assert count <= burst + rate * (end - begin) + 1e-6
+
+
+def test_a_clock_that_stands_or_goes_back_gives_nothing():
+    bucket = TokenBucket(10.0, 1.0)
+    bucket.take(5.0)
+
+    assert bucket.take(5.0) > 0
+    assert bucket.take(4.0) > 0
 
 
 def test_five_frames_a_second_with_the_catch_up_of_a_long_cut_are_never_refused():
@@ -108,6 +124,14 @@ def test_the_pending_handshake_that_waited_longest_is_cut_for_a_new_one():
 
     assert [pending.enter(k, "a") for k in range(5)] == [None, None, None, 0, 1]
     assert len(pending) == 3
+
+
+def test_a_source_with_too_many_pending_handshakes_loses_its_own():
+    pending: PendingHandshakes[str] = PendingHandshakes(max_sockets=100, max_per_source=2)
+    pending.enter("other", "b")
+
+    assert [pending.enter(name, "a") for name in ("x", "y", "z")] == [None, None, "x"]
+    assert pending.enter("other-2", "b") is None
 
 
 def test_a_handshake_that_sent_its_token_is_no_longer_pending():
