@@ -13,7 +13,7 @@ from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
-from rse_pf.server.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
+from rse_pf.server.gateway.handshake import HandshakePolicy, Rejected, RequestHead
 from rse_pf.wire.refusal import refusal_body
 
 REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
@@ -56,13 +56,13 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
     policy = HandshakePolicy(PlatformSettings(), KeySet({}))
 
     refused = policy.decide(
-        HandshakeRequest(path=b"/ws", authorization="Bearer x", offered=["rse-pf.v1.json"]),
+        RequestHead(b"/ws", {b"authorization": b"Bearer x", b"sec-websocket-protocol": b"rse-pf.v1.json"}),
         is_full=False,
         anonymous="",
         now_s=0.0,
     )
     origin = policy.decide(
-        HandshakeRequest(path=b"/ws", authorization="", offered=[], origin="https://elsewhere.example"),
+        RequestHead(b"/ws", {b"origin": b"https://elsewhere.example"}),
         is_full=False,
         anonymous="",
         now_s=0.0,

@@ -15,8 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 
-import msgspec
-
 from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
 from rse_pf.auth.tokens import (
     Claims,
@@ -35,7 +33,7 @@ from rse_pf.wire import SUBPROTOCOLS, codec_for
 from rse_pf.wire.refusal import CUT_OFF, refusal_body
 
 __all__ = [
-    "HEALTH", "Accepted", "HandshakePolicy", "HandshakeRequest", "Rejected", "RequestHead",
+    "HEALTH", "Accepted", "HandshakePolicy", "Rejected", "RequestHead",
     "banned_rejection",
 ]  # fmt: skip
 
@@ -129,6 +127,10 @@ class RequestHead:
         text = self.text(name)
         return [word.strip() for word in text.split(",")] if "," in text else [text]
 
+    def token(self) -> str:
+        """Return the token of the robot, from a header or a sub-protocol; "" if there is none."""
+        return carried_token(self.text(b"authorization"), self.words(b"sec-websocket-protocol"))
+
     def _read_key(self) -> bytes:
         headers = self._headers
         key = headers.get(b"sec-websocket-key", b"")
@@ -193,24 +195,6 @@ def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, st
     return Rejected(status=status, body=body, result=result, headers=headers, answer=answer)
 
 
-class HandshakeRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """The parts of a handshake that decide whether it is accepted; a header that is absent is empty.
-
-    Attributes:
-        path: The path with its query.
-        authorization: The header ``Authorization``.
-        offered: The sub-protocols that the robot offers, in its order.
-        origin: The header ``Origin``, which browsers send.
-        host: The header ``Host``.
-    """
-
-    path: bytes
-    authorization: str
-    offered: list[str]
-    origin: str = ""
-    host: str = ""
-
-
 class HandshakePolicy:
     """The rules of one worker for handshakes."""
 
@@ -250,49 +234,39 @@ class HandshakePolicy:
         )  # fmt: skip
 
     def decide(
-        self,
-        request: HandshakeRequest,
-        *,
-        is_full: bool,
-        anonymous: str,
-        now_s: float,
+        self, head: RequestHead, *, is_full: bool, anonymous: str, now_s: float
     ) -> Accepted | Rejected:
         """Return the accepted robot, or the HTTP answer that rejects the handshake.
 
         Args:
-            request: The parts of the request that decide.
+            head: The head of the request.
             is_full: Whether the worker has its greatest number of robots.
             anonymous: Name of the robot where no token is required.
             now_s: Unix time in seconds.
         """
-        path, authorization, offered = request.path, request.authorization, request.offered
         if self._conformance_echo:
             return Accepted(robot=RobotId(DEFAULT_TENANT, anonymous), codec="", subprotocol="")
-        if path == _HEALTH_PATH:
+        if head.path == _HEALTH_PATH:
             return self._healthy
-        if path.partition(b"?")[0] != self._path:
+        if head.path.partition(b"?")[0] != self._path:
             return self._not_found
-        if not self._origins.allows(request.origin, request.host):
+        if not self._origins.allows(head.text(b"origin"), head.text(b"host")):
             return self._forbidden
         if is_full:
             return self._full
-        codec = codec_for(offered)
-        name = codec or ""
+        codec = codec_for(head.words(b"sec-websocket-protocol")) or ""
+        verdict: Accepted | Rejected
         if self.keys is None:
-            accepted = Accepted(
-                robot=RobotId(DEFAULT_TENANT, anonymous), codec=name, subprotocol=SUBPROTOCOLS.get(name, "")
-            )
-            return self._no_subprotocol if codec is None else accepted
-        token = carried_token(authorization, offered)
-        verdict = self._with_token(token, now_s, codec=name)
-        return self._no_subprotocol if codec is None and isinstance(verdict, Accepted) else verdict
+            robot = RobotId(DEFAULT_TENANT, anonymous)
+            verdict = Accepted(robot=robot, codec=codec, subprotocol=SUBPROTOCOLS.get(codec, ""))
+        else:
+            verdict = self._with_token(head.token(), self.keys, now_s, codec=codec)
+        return self._no_subprotocol if not codec and isinstance(verdict, Accepted) else verdict
 
-    def _with_token(self, token: str, now_s: float, *, codec: str) -> Accepted | Rejected:
+    def _with_token(self, token: str, keys: KeySet, now_s: float, *, codec: str) -> Accepted | Rejected:
         """Accept the robot of *token*, or return the rejection."""
-        if self.keys is None:
-            return replace(self._no_token, reason=_NO_KEYS)
         try:
-            claims = verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
+            claims = verify_token(token, keys=keys, now=now_s, settings=self._settings.auth)
         except Unauthorized as error:
             proven = proven_refusal(error)
             refused = None if proven is None else _proven_rejection(proven, now_s)

@@ -23,7 +23,6 @@ from aiofastnet.selector_transport import SelectorSocketTransport
 from picows import picows as _picows
 
 from rse_pf.auth.claimed import claimed_by
-from rse_pf.auth.origins import carried_token
 from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES, WRITE_BUFFER_BYTES
 from rse_pf.http.unauthenticated import PendingHandshakes
 from rse_pf.server.gateway.audit_recorder import AuditRecorder
@@ -34,7 +33,6 @@ from rse_pf.server.gateway.handshake import (
     HEALTH,
     Accepted,
     HandshakePolicy,
-    HandshakeRequest,
     Rejected,
     RequestHead,
     banned_rejection,
@@ -265,9 +263,8 @@ class RobotSockets:
         source, token = pending.peer, ""
         try:
             source = self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
-            authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
-            token = carried_token(authorization, offered)
-            verdict = self._verdict(head, authorization, offered, source)
+            token = head.token()
+            verdict = self._verdict(head, source)
             self._recorder.record_verdict(verdict, source, token, self._handshake.keys)
         except Exception as error:  # noqa: BLE001  other robots are served on
             self._context.log.error("defect", at="handshake", traceback=repr(error))
@@ -300,20 +297,12 @@ class RobotSockets:
         except OSError:
             pending.close()
 
-    def _verdict(
-        self, head: RequestHead, authorization: str, offered: list[str], source: str
-    ) -> Accepted | Rejected:
+    def _verdict(self, head: RequestHead, source: str) -> Accepted | Rejected:
         now = self._context.clocks.monotonic()
         if self._sources.wait_s(source, now) > 0:
             return replace(self._handshake.too_fast, reason="address-rate")
         verdict = self._handshake.decide(
-            HandshakeRequest(
-                path=head.path,
-                authorization=authorization,
-                offered=offered,
-                origin=head.text(b"origin"),
-                host=head.text(b"host"),
-            ),
+            head,
             is_full=len(self._dispatcher.connections) >= self._max_robots,
             anonymous=self._new_name(),
             now_s=self._context.clocks.wall(),

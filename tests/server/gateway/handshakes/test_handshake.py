@@ -14,7 +14,6 @@ from rse_pf.server.gateway.handshake import (
     HEALTH,
     Accepted,
     HandshakePolicy,
-    HandshakeRequest,
     Rejected,
     RequestHead,
 )
@@ -31,12 +30,18 @@ def token(ttl_s: float = 100.0, now: float = NOW_S) -> str:
 
 def judge(policy: HandshakePolicy | None = None, **changed: object) -> Accepted | Rejected:
     asked: dict = {
-        "path": b"/ws", "authorization": f"Bearer {token()}", "offered": [SUBPROTOCOLS["bin"]],
-        "is_full": False, "anonymous": "anonymous-1", "now_s": NOW_S, **changed,
+        "path": b"/ws", "authorization": f"Bearer {token()}", "offered": [SUBPROTOCOLS["bin"]], "origin": "",
+        "host": "", "is_full": False, "anonymous": "anonymous-1", "now_s": NOW_S, **changed,
     }  # fmt: skip
     worker = {name: asked.pop(name) for name in ("is_full", "anonymous", "now_s")}
     policy = policy or HandshakePolicy(SETTINGS, KEY.key_set())
-    return policy.decide(HandshakeRequest(**asked), **worker)
+    headers = {
+        b"authorization": asked["authorization"].encode("ascii", "surrogateescape"),
+        b"sec-websocket-protocol": ", ".join(asked["offered"]).encode("ascii", "surrogateescape"),
+        b"origin": asked["origin"].encode(),
+        b"host": asked["host"].encode(),
+    }
+    return policy.decide(RequestHead(asked["path"], headers), **worker)
 
 
 def test_a_browser_may_offer_its_token_as_a_subprotocol_which_is_never_selected():

@@ -12,7 +12,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.server.gateway.connection import RobotConnection
-from rse_pf.server.gateway.handshake import Accepted, HandshakeRequest
+from rse_pf.server.gateway.handshake import Accepted, RequestHead
 from rse_pf.server.log import JsonLog
 from rse_pf.wire import SUBPROTOCOLS, Failure, Hello, Renew, Welcome
 from tests.kit.fakes import FakeWire
@@ -38,8 +38,12 @@ class Worker(WorkerParts):
     def record_verdict(self, token: str) -> Accepted:
         """Judge a handshake that is good."""
         accepted = self.handshake.decide(
-            HandshakeRequest(
-                path=b"/ws", authorization=f"Bearer {token}", offered=[SUBPROTOCOLS["bin"]]
+            RequestHead(
+                b"/ws",
+                {
+                    b"authorization": f"Bearer {token}".encode(),
+                    b"sec-websocket-protocol": SUBPROTOCOLS["bin"].encode(),
+                },
             ),
             is_full=False, anonymous="a", now_s=self.clocks.wall(),
         )  # fmt: skip
