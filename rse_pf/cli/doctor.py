@@ -8,7 +8,6 @@ example:
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import platform
@@ -20,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rse_pf.command_line.extras import EXTRAS, VERBS_NEED, modules_of
+from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.command_line.packages import Defect, find_defect
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
@@ -27,7 +27,7 @@ from rse_pf.native import load_core
 from rse_pf.pnp.native_solver import open_solver
 from rse_pf.terminal import show
 
-__all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
+__all__ = ["ACTION", "Finding", "check_machine", "report"]
 
 _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
@@ -49,11 +49,7 @@ class Finding:
         return [f"{self.grade:<4}  {self.what}", *([f"      fix: {self.fix}"] if self.fix else [])]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare no options but the common ones."""
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def check_this_machine(request: NoOptions, settings: PlatformSettings) -> int:
     """Print every finding; 1 if something required failed."""
     has_demo = find_defect("cv2", EXTRAS["demo"].modules["cv2"]) is None
     return report(check_machine(settings), f"ready: rse-pf local{', or rse-pf demo' if has_demo else ''}")
@@ -220,3 +216,6 @@ def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:
     """Return what is ok if it needs no *fix*; else it warns, or fails if it *is_required*."""
     grade = "fail" if is_required else "warn"
     return Finding(grade=grade if fix else "ok", what=what, fix=fix)
+
+
+ACTION = Action(request=NoOptions, run=check_this_machine)

@@ -10,18 +10,18 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from rse_pf import errors
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.terminal import show, show_page
 
-__all__ = ["Explanation", "add_arguments", "errors_page", "explain", "explanations", "run"]
+__all__ = ["ACTION", "Explanation", "errors_page", "explain", "explanations"]
 
 _PARTS = re.compile(
     r"(?P<meaning>[^\n]+)\n.*?\n *Cause: (?P<cause>.+?)\n *Check: (?P<check>.+?)\n *Fix: (?P<fix>.+?)\s*",
@@ -49,21 +49,23 @@ class Explanation:
     fix: str
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("code", nargs="?", metavar="CODE", help="such as no-consensus, or NoConsensus")
-    parser.add_argument("--markdown", action="store_true", help="print docs/errors.md")
+@dataclass(frozen=True, kw_only=True)
+class ErrorsRequest:
+    """The error that is explained; None means all of them."""
+
+    code: str | None = option(nargs="?", metavar="CODE", help="such as no-consensus, or NoConsensus")
+    markdown: bool = option("--markdown", help="print docs/errors.md")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_errors(request: ErrorsRequest, settings: PlatformSettings) -> None:
     """Print one explanation, all codes, or the page."""
     explained = explanations()
-    if args.markdown:
-        if args.code is not None:
+    if request.markdown:
+        if request.code is not None:
             raise UsageError("--markdown prints all codes", hint="leave out the code, or --markdown")
         show_page(errors_page(explained))
-        return 0
-    if args.code is None:
+        return
+    if request.code is None:
         width = max(len(explanation.code) for explanation in explained)
         show(
             *(
@@ -71,12 +73,15 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
                 for explanation in explained
             )
         )
-        return 0
-    matching = [explanation for explanation in explained if args.code in (explanation.code, explanation.name)]
+        return
+    matching = [
+        explanation for explanation in explained if request.code in (explanation.code, explanation.name)
+    ]
     if not matching:
         codes = [explanation.code for explanation in explained]
         raise UsageError(
-            f"there is no error {args.code[:80]!r}", hint=did_you_mean(args.code, codes, "see rse-pf errors")
+            f"there is no error {request.code[:80]!r}",
+            hint=did_you_mean(request.code, codes, "see rse-pf errors"),
         )
     (explanation,) = matching
     lines = (
@@ -86,7 +91,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         f"  fix    {explanation.fix}",
     )
     show(*(line.replace("``", "") for line in lines))  # a terminal does not set code in another type
-    return 0
 
 
 def explanations() -> list[Explanation]:
@@ -113,3 +117,6 @@ def errors_page(explained: Iterable[Explanation]) -> str:
         for explanation in explained
     )
     return _INTRODUCTION + "".join(sections)
+
+
+ACTION = Action(request=ErrorsRequest, run=show_errors)

@@ -1,7 +1,7 @@
 """Run one verb of the command line: find it, read the settings, print an error as two lines.
 
-A verb is a module, see `verb_module`: its docstring is its help page, ``add_arguments(parser)`` declares
-its options and ``run(args, settings)`` returns the exit code.  Only the module of the verb is imported.
+A verb is a module, see `verb_module`: its docstring is its help page, and its ``ACTION`` holds its request or
+its actions, see `rse_pf.command_line.options`.  Only the module of the verb is imported.
 Exit codes: 0 done, 1 failed, 2 wrong call or settings, 130 interrupted.  Named errors print no traceback.
 """
 
@@ -112,10 +112,7 @@ def parser_of(name: str) -> Parser:
         allow_abbrev=False,
     )
     add_settings(parser)
-    if hasattr(verb, "ACTION"):
-        add_action(parser, verb.ACTION)
-    else:
-        verb.add_arguments(parser)
+    add_action(parser, verb.ACTION)
     return parser
 
 
@@ -135,14 +132,12 @@ def _run(words: list[str]) -> int:
         )
     if name not in VERBS:
         raise UsageError(f"there is no verb {name!r}", hint=did_you_mean(name, VERBS))
-    verb, parser = verb_module(name), parser_of(name)
     try:
-        args = parser.parse_args(rest)
+        parsed = parser_of(name).parse_args(rest)
     except SystemExit as over:  # --help has printed its page
         return int(over.code or _EXIT_OK)
     try:
-        settings = load_settings(args.settings)
-        code: int = perform(args, settings) if hasattr(verb, "ACTION") else verb.run(args, settings)
+        code = perform(parsed, load_settings(parsed.settings))
     except SettingsError as error:
         error.hint = _hint_for_option(error, rest)
         raise

@@ -14,13 +14,14 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import at_work, counted, show, show_json
@@ -31,69 +32,75 @@ if TYPE_CHECKING:
     from rse_pf.extensions.recording.replay.run import Overview
     from rse_pf.extensions.recording.replay.solving import Overrides
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _SHOWN, _IN_PAGE, _LISTED_IN_JSON = 20, 5, 500
 _ENGINES = ("native", "opencv")
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording, or a folder of them")
-    parser.add_argument(
-        "--command", metavar="ID", help="show this command: CONNECTION:ID, or ID if it is clear"
+@dataclass(frozen=True, kw_only=True)
+class ReplayRequest:
+    """A recording, and what is solved again and shown."""
+
+    file: Path = option(metavar="FILE", help="a recording, or a folder of recordings")
+    command: str | None = option(
+        "--command", metavar="ID", help="show this command: CONNECTION:ID, or ID if only one command has it"
     )
-    parser.add_argument("--all", action="store_true", help="solve every command again and say what changed")
-    parser.add_argument(
+    all: bool = option("--all", help="solve every command again, and show which answers changed")
+    engine: str | None = option(
         "--engine", choices=_ENGINES, help="solve with this engine instead of the recorded one"
     )
-    parser.add_argument("--inlier-px", type=float, metavar="PX", help="try another limit for inliers")
-    parser.add_argument(
-        "--max-iterations", type=int, metavar="N", help="try another number of RANSAC iterations"
+    inlier_px: float | None = option(
+        "--inlier-px", metavar="PX", help="use this limit of the reprojection error of inliers"
     )
-    parser.add_argument("--html", type=Path, metavar="PAGE", help="write the report to one HTML file")
-    parser.add_argument("--json", action="store_true", help="print JSON; everything is solved again")
+    max_iterations: int | None = option(
+        "--max-iterations", metavar="N", help="use this number of RANSAC iterations"
+    )
+    html: Path | None = option("--html", metavar="PAGE", help="write the report to one HTML file")
+    json: bool = option("--json", help="print JSON; all commands are solved again")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def replay_recording(request: ReplayRequest, settings: PlatformSettings) -> int:
     """List, solve again or show; return 1 if an answer that should be equal is not."""
     require("replay")
     from rse_pf.extensions.recording.replay.limited import LimitedReplay
 
-    overrides = _overrides(args)
-    _check(args)
+    overrides = _overrides(request)
+    _check(request)
     with LimitedReplay(settings) as replay:
-        if args.command is not None:
-            return _show_one(args, replay, overrides)
-        return _show_all(args, replay, overrides)
+        if request.command is not None:
+            return _show_one(request, request.command, replay, overrides)
+        return _show_all(request, replay, overrides)
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check(request: ReplayRequest) -> None:
     """Raise UsageError for what contradicts itself, before any work."""
-    path: Path = args.file
-    if args.command is not None and args.all:
+    path = request.file
+    if request.command is not None and request.all:
         raise UsageError("--command is one command, and --all is all of them", hint="leave one of them out")
-    if args.command is not None and not _IDENTITY.fullmatch(args.command):
+    if request.command is not None and not _IDENTITY.fullmatch(request.command):
         raise UsageError(
-            f"{args.command[:60]!r} is no command",
+            f"{request.command[:60]!r} is no command",
             hint="write CONNECTION:ID, as rse-pf replay FILE lists them",
         )
-    page: Path | None = args.html
+    page = request.html
     if page is not None and not page.parent.is_dir():
         raise UsageError(f"--html: there is no folder {page.parent}", hint="create it, or choose another")
     if page is not None and (page.is_dir() or (page.exists() and path.exists() and page.samefile(path))):
         raise UsageError(f"--html: {page} is a folder, or the recording", hint="choose another file")
 
 
-def _overrides(args: argparse.Namespace) -> Overrides:
+def _overrides(request: ReplayRequest) -> Overrides:
     """Return what is to be tried; raises UsageError for a number out of its range."""
     from rse_pf.errors import BadRequest
     from rse_pf.extensions.recording.replay.solving import Overrides
 
-    if args.inlier_px is not None and not math.isfinite(args.inlier_px):
-        raise UsageError(f"--inlier-px {args.inlier_px} is no number of pixels", hint="try 2, 4, 8 or 16")
-    chosen = Overrides(engine=args.engine, inlier_px=args.inlier_px, max_iterations=args.max_iterations)
+    if request.inlier_px is not None and not math.isfinite(request.inlier_px):
+        raise UsageError(f"--inlier-px {request.inlier_px} is no number of pixels", hint="try 2, 4, 8 or 16")
+    chosen = Overrides(
+        engine=request.engine, inlier_px=request.inlier_px, max_iterations=request.max_iterations
+    )
     try:
         chosen.of(None)
     except BadRequest as error:
@@ -106,27 +113,29 @@ def _overrides(args: argparse.Namespace) -> Overrides:
 # --- a whole recording ------------------------------------------------------------------------------------
 
 
-def _show_all(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
-    solve = bool(args.all or args.json or overrides.changes)
+def _show_all(request: ReplayRequest, replay: LimitedReplay, overrides: Overrides) -> int:
+    solve = bool(request.all or request.json or overrides.changes)
     with at_work("reading the recording"):
         overview = replay.overview(
-            args.file, solve=solve, overrides=overrides, worst=_LISTED_IN_JSON if args.json else _SHOWN
+            request.file, solve=solve, overrides=overrides, worst=_LISTED_IN_JSON if request.json else _SHOWN
         )
         reports = []
-        if args.html is not None:
-            reports = [replay.command(args.file, each.id, overrides) for each in overview.troubles[:_IN_PAGE]]
-    if args.html is not None:
-        _write_page(args.html, reports, overview, args.file.name)
-    if args.json:
+        if request.html is not None:
+            reports = [
+                replay.command(request.file, each.id, overrides) for each in overview.troubles[:_IN_PAGE]
+            ]
+    if request.html is not None:
+        _write_page(request.html, reports, overview, request.file.name)
+    if request.json:
         import msgspec
 
         show_json(msgspec.to_builtins(overview), indent=2)
     else:
-        _show_overview(overview, args)
+        _show_overview(overview, request)
     return 1 if solve and overview.different and not overrides.changes else 0
 
 
-def _show_overview(overview: Overview, args: argparse.Namespace) -> None:
+def _show_overview(overview: Overview, request: ReplayRequest) -> None:
     show(
         f"{counted(overview.commands, 'command')} of {counted(overview.robots, 'robot')} "
         f"in {overview.seconds:.1f} s, {counted(overview.files, 'file')}"
@@ -153,18 +162,18 @@ def _show_overview(overview: Overview, args: argparse.Namespace) -> None:
         show(f"  {trouble.kind:<10} {trouble.id}  {trouble.robot}  {trouble.what}")
     if bad > len(overview.troubles):
         show(f"  and {bad - len(overview.troubles)} more; --json lists up to {_LISTED_IN_JSON}")
-    show("", f"look at one: rse-pf replay {args.file} --command {overview.troubles[0].id}")
+    show("", f"look at one: rse-pf replay {request.file} --command {overview.troubles[0].id}")
 
 
 # --- one command ------------------------------------------------------------------------------------------
 
 
-def _show_one(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
+def _show_one(request: ReplayRequest, command: str, replay: LimitedReplay, overrides: Overrides) -> int:
     with at_work("solving the command again"):
-        report = replay.command(args.file, args.command, overrides, with_picture=args.html is not None)
-    if args.html is not None:
-        _write_page(args.html, [report], None, args.file.name)
-    if args.json:
+        report = replay.command(request.file, command, overrides, with_picture=request.html is not None)
+    if request.html is not None:
+        _write_page(request.html, [report], None, request.file.name)
+    if request.json:
         show_json(_report_json(report), indent=2)
     else:
         _show_report(report)
@@ -246,3 +255,6 @@ def _write_page(path: Path, reports: Any, overview: Overview | None, name: str) 
         path.write_text(html_page(reports, overview=overview, title=f"Replay of {name}"), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{path} cannot be written: {error.strerror}", hint="choose another file") from error
+
+
+ACTION = Action(request=ReplayRequest, run=replay_recording)

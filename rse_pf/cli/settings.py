@@ -8,50 +8,50 @@ examples:
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from typing import Any
 
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings, setting_rows, settings_page
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "group",
+@dataclass(frozen=True, kw_only=True)
+class SettingsRequest:
+    """The settings that are shown, and how."""
+
+    group: str | None = option(
         nargs="?",
         help="show one group only, such as scaling; or one setting: scaling.min_servers; or: digest",
     )
-    shape = parser.add_mutually_exclusive_group()
-    shape.add_argument("--json", action="store_true", help="print all values as JSON")
-    shape.add_argument("--markdown", action="store_true", help="print docs/settings.md")
+    json: bool = option("--json", exclusive="format", help="print all values as JSON")
+    markdown: bool = option("--markdown", exclusive="format", help="print docs/settings.md")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_settings(request: SettingsRequest, settings: PlatformSettings) -> None:
     """Print the table."""
     values = settings.to_dict()
-    if args.group == "digest":
+    if request.group == "digest":
         show(settings.digest())
-        return 0
-    if args.markdown:
+        return
+    if request.markdown:
         show_page(settings_page())
-        return 0
-    if args.group is not None:
-        values = _choose(args.group, values)
-    if args.json:
+        return
+    if request.group is not None:
+        values = _choose(request.group, values)
+    if request.json:
         show_json(values, indent=2)
-        return 0
+        return
     for row in setting_rows(settings):
         if row.name not in values.get(row.group, ()):
             continue
         changed = "" if row.value == row.default else f"  (default {row.default})"
         unit = f" {row.unit}" if row.unit else ""
         show(f"{row.group}.{row.name} = {row.value}{unit}{changed}", f"    {row.doc} [{row.source}]")
-    return 0
 
 
 def _choose(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -66,3 +66,6 @@ def _choose(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str,
         names = [f"{group}.{name}" for name in values[group]]
         raise UsageError(f"no setting named {full!r}", hint=did_you_mean(full, names))
     return {group: {name: values[group][name]}}
+
+
+ACTION = Action(request=SettingsRequest, run=show_settings)

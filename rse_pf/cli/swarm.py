@@ -13,105 +13,115 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import os
 import secrets
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import UsageError
 
 if TYPE_CHECKING:
     from rse_pf.extensions.experiments.load.run import TargetPlatform
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    add = parser.add_argument
-    add(
-        "--scenario",
-        type=Path,
-        metavar="FILE",
-        help="what robots do, such as scenario.json of an earlier run",
+@dataclass(frozen=True, kw_only=True)
+class SwarmRequest:
+    """The load, and the platform that gets it; None means the value of the scenario."""
+
+    settings: Path | None = None
+    scenario: Path | None = option(
+        "--scenario", metavar="FILE", help="file of the load, such as scenario.json of an earlier run"
     )
-    add("--robots", type=int, help="number of robots (default: 10)")
-    add("--fps", type=float, help="frames per second of each robot (default: 5, as in the paper)")
-    add("--join-every", type=float, metavar="S", help="time between two robots that join (default: 0)")
-    add("--seconds", type=float, metavar="S", help="duration after all have joined (default: 20)")
-    add("--matches", type=int, help="matches per frame (default: 200)")
-    add("--codec", help="zlib (default, as in the paper), json or bin")
-    add("--service", help="pnp (default) or echo")
-    add("--link", metavar="PROFILE", help="emulate a network: none, paper, wifi-bad or lte")
-    add("--deadline", type=float, metavar="S", help="deadline of each command (default: 5)")
-    add(
-        "--latest-only",
-        action="store_true",
-        help="let the platform skip a frame when a newer one has arrived",
+    robots: int | None = option("--robots", help="number of robots (default: 10)")
+    fps: float | None = option("--fps", help="frames per second of each robot (default: 5, as in the paper)")
+    join_every: float | None = option(
+        "--join-every", metavar="S", help="time between two robots that join (default: 0)"
     )
-    add("--processes", type=int, help="processes of the generator (default: 1)")
-    add("--seed", type=int, help="seed of problems, jitter and link cuts (default: 0)")
-    add("--servers", type=int, help="servers of the platform that is started (default: local.servers)")
-    add("--name", help="use the platform that rse-pf local runs under this name")
-    add("--url", help="use the platform at this address, with --token-from")
-    add("--token-from", metavar="NAME", help="with --url: sign tokens with the key of this local platform")
-    add("--out", type=Path, default=Path("out-swarm"), metavar="DIR", help="records (default: out-swarm)")
-    add("--record", type=Path, metavar="DIR", help="record what robots and the started servers say in DIR")
-    add("--quiet", action="store_true", help="print only the result")
+    seconds: float | None = option(
+        "--seconds", metavar="S", help="duration after all have joined (default: 20)"
+    )
+    matches: int | None = option("--matches", help="matches per frame (default: 200)")
+    codec: str | None = option("--codec", help="zlib (default, as in the paper), json or bin")
+    service: str | None = option("--service", help="pnp (default) or echo")
+    link: str | None = option(
+        "--link", metavar="PROFILE", help="emulate a network: none, paper, wifi-bad or lte"
+    )
+    deadline: float | None = option("--deadline", metavar="S", help="deadline of each command (default: 5)")
+    latest_only: bool = option(
+        "--latest-only", help="let the platform skip a frame when a newer one has arrived"
+    )
+    processes: int | None = option("--processes", help="processes that generate the load (default: 1)")
+    seed: int | None = option("--seed", help="seed of problems, jitter and link failures (default: 0)")
+    servers: int | None = option(
+        "--servers", help="servers of the platform that is started (default: local.servers)"
+    )
+    name: str | None = option("--name", help="use the platform that rse-pf local runs under this name")
+    url: str | None = option("--url", help="use the platform at this address, with --token-from")
+    token_from: str | None = option(
+        "--token-from", metavar="NAME", help="with --url: sign tokens with the key of this local platform"
+    )
+    out: Path = option("--out", default=Path("out-swarm"), metavar="DIR", help="records (default: out-swarm)")
+    record: Path | None = option(
+        "--record", metavar="DIR", help="record the messages of robots and of the started servers in DIR"
+    )
+    quiet: bool = option("--quiet", help="print only the result")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def swarm(request: SwarmRequest, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
     from rse_pf.extensions.experiments.load.run import run_swarm
     from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario
     from rse_pf.extensions.recording.writer import with_recordings
 
-    given = {
-        "robots": args.robots, "fps": args.fps, "seconds": args.seconds, "codec": args.codec,
-        "matches": args.matches, "seed": args.seed, "join_every_s": args.join_every,
-        "deadline_s": args.deadline, "keep": False if args.latest_only else None, "service": args.service,
-        "processes": args.processes, "link": args.link,
-    }  # fmt: skip
-    scenario = LoadScenario() if args.scenario is None else read_scenario(args.scenario)
+    renamed = {"join_every": "join_every_s", "deadline": "deadline_s"}
+    names = (
+        "robots", "fps", "seconds", "codec", "matches", "seed", "join_every", "deadline", "service",
+        "processes", "link",
+    )  # fmt: skip
+    given: dict[str, Any] = {renamed.get(name, name): getattr(request, name) for name in names}
+    given["keep"] = False if request.latest_only else None
+    scenario = LoadScenario() if request.scenario is None else read_scenario(request.scenario)
     scenario = replace(scenario, **{name: value for name, value in given.items() if value is not None})
-    platform = _platform(args, settings)
+    platform = _platform(request, settings)
     if platform is None:
         require("swarm")
-    if args.servers is not None:
+    if request.servers is not None:
         if platform is not None:
             raise UsageError(
                 "--servers needs a platform that is started for the run", hint="leave out --name and --url"
             )
-        settings = settings.replace(local={"servers": args.servers})
-    if args.record is not None and platform is not None:
+        settings = settings.replace(local={"servers": request.servers})
+    if request.record is not None and platform is not None:
         raise UsageError(
             "--record needs a platform that is started for the run",
             hint="start it with rse-pf local --record, or leave out --name and --url",
         )
     if platform is None:
-        settings = with_recordings(settings, args.record)
-    return run_swarm(scenario, settings, out=args.out, platform=platform, quiet=args.quiet)
+        settings = with_recordings(settings, request.record)
+    return run_swarm(scenario, settings, out=request.out, platform=platform, quiet=request.quiet)
 
 
-def _platform(args: argparse.Namespace, settings: PlatformSettings) -> TargetPlatform | None:
+def _platform(request: SwarmRequest, settings: PlatformSettings) -> TargetPlatform | None:
     from rse_pf.extensions.experiments.load.run import TargetPlatform
     from rse_pf.local.firewall import key_file, read_key
     from rse_pf.local.state import read_state, settings_file, state_folder
 
-    name = args.token_from if args.url is not None else args.name
-    if args.url is not None and args.name is not None:
+    name = request.token_from if request.url is not None else request.name
+    if request.url is not None and request.name is not None:
         raise UsageError("--name and --url exclude each other", hint="use one of them")
-    if args.url is None and args.token_from is not None:
+    if request.url is None and request.token_from is not None:
         raise UsageError("--token-from needs --url", hint="use --name alone: it finds address and key")
-    if args.url is not None and urlsplit(args.url).scheme not in ("ws", "wss"):
-        raise UsageError(f"{args.url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
-    if args.url is not None and name is None:
+    if request.url is not None and urlsplit(request.url).scheme not in ("ws", "wss"):
+        raise UsageError(f"{request.url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
+    if request.url is not None and name is None:
         raise UsageError(
             "--url needs --token-from for tokens", hint="name a local platform with --token-from"
         )
@@ -119,14 +129,17 @@ def _platform(args: argparse.Namespace, settings: PlatformSettings) -> TargetPla
         return None
     folder = state_folder(name, os.environ)
     state = read_state(folder)
-    url = args.url or (state.url if state is not None else "")
+    url = request.url or (state.url if state is not None else "")
     if not url:
         raise UsageError(f"no platform {name!r} is running", hint=f"start it: rse-pf local --name {name}")
     key = read_key(key_file(folder))
     file = settings_file(folder)
-    auth = (load_settings(file) if file.exists() and args.settings is None else settings).auth
+    auth = (load_settings(file) if file.exists() and request.settings is None else settings).auth
 
     def token_of(robot: str) -> str:
         return key.issue(robot, now=time.time(), token_id=secrets.token_hex(8), settings=auth)
 
     return TargetPlatform(url, token_of)
+
+
+ACTION = Action(request=SwarmRequest, run=swarm)

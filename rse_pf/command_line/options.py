@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import UsageError
 
-__all__ = ["Action", "Parser", "add_action", "option", "perform"]
+__all__ = ["Action", "NoOptions", "Parser", "add_action", "option", "perform"]
 
 _CONVERTERS: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Path": Path}
 """Function that reads the text of an option, by the first type in the annotation of its field."""
@@ -46,6 +46,11 @@ class Action:
     run: Callable[[Any, Any], int | None] | None = None
     actions: Mapping[str, Action] = field(default_factory=dict)
     default: str = ""
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """The request of an action that has no options."""
 
 
 def option(*flags: str, default: Any = None, section: str = "", exclusive: str = "", **keywords: Any) -> Any:
@@ -188,7 +193,8 @@ def _add_option(group: Any, declared: Field[Any]) -> None:
     converter = None if kind is None else _CONVERTERS.get(kind[1])
     default = list(declared.default) if isinstance(declared.default, tuple) else declared.default
     if kind is not None and kind[1] == "bool" and "action" not in keywords:
-        keywords["action"] = "store_true" if default is not True else "store_false"
+        default = bool(default)
+        keywords["action"] = "store_false" if default else "store_true"
     elif converter is not None:
         keywords["type"] = converter
     if flags:

@@ -31,7 +31,7 @@ def test_a_figure_that_a_short_run_misses_is_named_and_the_verb_fails(tmp_path, 
         (args.out / "report.json").write_text(json.dumps({"ate_cm": [1.2, 1.7], "lost_frames": [0, 0]}))
         return 0
 
-    monkeypatch.setattr(experiment, "run", run_short)
+    monkeypatch.setattr(experiment, "perform", run_short)
 
     assert experiment._rerun(tmp_path, PlatformSettings()) == 1
     told = capsys.readouterr().out

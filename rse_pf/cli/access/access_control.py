@@ -6,23 +6,25 @@ out must not look like a success.
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 from rse_pf.audit.entry import Value
 from rse_pf.audit.operator import record
 from rse_pf.auth.roster import DisabledRobot, EnrolledRobot, check_quotas, check_robot, check_tenant
 from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.local.state import state_folder
 
 __all__ = [
-    "NOT_ENROLLED_HINT", "add_place", "add_platform", "choose_robot", "described",
-    "max_token_s", "open_access_control", "read_quotas", "record_action",
-    "tenant_or_default", "which_platform",
+    "NOT_ENROLLED_HINT", "PlatformRequest", "RobotRequest", "TenantRequest", "choose_robot", "described",
+    "max_token_s", "read_quotas", "tenant_or_default",
 ]  # fmt: skip
 
 NOT_ENROLLED_HINT = (
@@ -31,19 +33,64 @@ NOT_ENROLLED_HINT = (
 _PLATFORM = "default"
 
 
-def add_place(parser: argparse.ArgumentParser) -> None:
-    """Declare which tenant is meant, and which platform."""
-    parser.add_argument(
+@dataclass(frozen=True, kw_only=True)
+class PlatformRequest:
+    """Which platform is meant: a local one, or the deployment on AWS."""
+
+    cloud: bool = option("--cloud", help="use the deployment on AWS in cloud.region")
+    name: str = option("--name", default=_PLATFORM, help=f"name of the local platform (default: {_PLATFORM})")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the state of the local platform; raises UsageError for a name that is none."""
+        return state_folder(self.name, os.environ)
+
+    @property
+    def as_option(self) -> str:
+        """The option that names the platform in another command, after a space."""
+        if self.cloud:
+            return " --cloud"
+        return "" if self.name == _PLATFORM else f" --name {self.name}"
+
+    def open_access_control(self, settings: PlatformSettings) -> AccessControlStore:
+        """Return the access control store of the platform; raises UsageError if there is none."""
+        if self.cloud:
+            from rse_pf.aws.account import open_account
+            from rse_pf.aws.storage.key_store import open_key_store
+
+            account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
+            return open_key_store(account, names).access_control_store()
+        from rse_pf.local.disk_watch import access_control_store
+        from rse_pf.local.firewall import key_set_file
+
+        if not key_set_file(self.folder).exists():
+            known = ", ".join(sorted(each.name for each in self.folder.parent.glob("*/"))) or "none"
+            raise UsageError(
+                f"there is no platform {self.name!r}", hint=f"start one with rse-pf local; known: {known}"
+            )
+        return access_control_store(self.folder)
+
+    def record(self, action: str, subject: str, **detail: Value) -> None:
+        """Write an action to the audit log of a local platform; in a cloud the bucket keeps all versions."""
+        if not self.cloud:
+            record(self.folder, action, subject, **detail)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TenantRequest(PlatformRequest):
+    """Which tenant of a platform is meant; None if it is not named."""
+
+    tenant: str | None = option(
         "--tenant",
-        help=f"tenant of the robot (default: {DEFAULT_TENANT}; to be named if another one has such a robot)",
+        help=f"tenant of the robot (default: {DEFAULT_TENANT}; required if another tenant has such a robot)",
     )
-    add_platform(parser)
 
 
-def add_platform(parser: argparse.ArgumentParser) -> None:
-    """Declare which platform is meant."""
-    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
-    parser.add_argument("--name", default=_PLATFORM, help=f"which local platform (default: {_PLATFORM})")
+@dataclass(frozen=True, kw_only=True)
+class RobotRequest(TenantRequest):
+    """Which robot of a platform is meant."""
+
+    robot: str = option(metavar="ROBOT", help="name of the robot, as in its tokens and logs")
 
 
 def choose_robot(
@@ -106,44 +153,6 @@ def tenant_or_default(tenant: str | None) -> str:
 def described(robot: str, tenant: str) -> str:
     """Return a robot as messages name it, always with its tenant."""
     return f"robot {robot!r} of tenant {tenant!r}"
-
-
-def which_platform(args: argparse.Namespace) -> str:
-    """Return the option that names the platform of *args* in another command, after a space."""
-    if args.cloud:
-        return " --cloud"
-    return "" if args.name == _PLATFORM else f" --name {args.name}"
-
-
-def open_access_control(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
-    """Return the access control store of the platform in *args*; raises UsageError if there is none."""
-    if args.cloud:
-        from rse_pf.aws.account import open_account
-        from rse_pf.aws.storage.key_store import open_key_store
-
-        account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
-        return open_key_store(account, names).access_control_store()
-    from rse_pf.local.disk_watch import access_control_store
-    from rse_pf.local.firewall import key_set_file
-    from rse_pf.local.state import state_folder
-
-    folder = state_folder(args.name, os.environ)
-    if not key_set_file(folder).exists():
-        known = ", ".join(sorted(each.name for each in folder.parent.glob("*/"))) or "none"
-        raise UsageError(
-            f"there is no platform {args.name!r}", hint=f"start one with rse-pf local; known: {known}"
-        )
-    return access_control_store(folder)
-
-
-def record_action(
-    args: argparse.Namespace, settings: PlatformSettings, action: str, subject: str, **detail: Value
-) -> None:
-    """Record an action in the audit log of a local platform; in a cloud the bucket keeps all versions."""
-    if not args.cloud:
-        from rse_pf.local.state import state_folder
-
-        record(state_folder(args.name, os.environ), action, subject, **detail)
 
 
 def max_token_s(settings: PlatformSettings) -> float:

@@ -6,9 +6,7 @@ key.  A server never decides by itself that two identities are one robot.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,21 +14,40 @@ from pathlib import Path
 
 from rse_pf.auth.roster import ROBOT_KEY, Roster
 from rse_pf.aws.storage import open_data_store
-from rse_pf.cli.access.access_control import described
+from rse_pf.cli.access.access_control import RobotRequest, described
 from rse_pf.command_line.map_store import with_store
+from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
-from rse_pf.local.state import state_folder
 from rse_pf.storage.object_store import ObjectStore
 from rse_pf.terminal import counted, show
 
-__all__ = ["Adopted", "adopt", "run_adopt"]
+__all__ = ["AdoptRequest", "Adopted", "adopt", "run_adopt"]
 
 _PRIVATE_STORE = "memory:"
 _THUMBPRINT = re.compile(r"[A-Za-z0-9_-]{43}")
 
 _PIECE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdoptRequest(RobotRequest):
+    """A robot, and the earlier identity whose data it gets."""
+
+    from_key: str = option(
+        "--from-key",
+        default="",
+        metavar="KEY",
+        help="id of the robot's earlier key (default: what was stored for the name without a key)",
+    )
+    store: str | None = option(
+        "--store", help="dir:PATH or s3:BUCKET (default: data.store, or the local platform's)"
+    )
+    not_enrolled: bool = option(
+        "--not-enrolled",
+        help="the robot has no key of its own, and uses tokens of rse-pf token issue",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,11 +60,12 @@ class Adopted:
     kept: tuple[str, ...]
 
 
-def run_adopt(args: argparse.Namespace, settings: PlatformSettings, roster: Roster) -> Adopted:
+def run_adopt(request: AdoptRequest, tenant: str, settings: PlatformSettings, roster: Roster) -> Adopted:
     """Do ``rse-pf robot adopt``, print what was moved, and return it.
 
     Args:
-        args: ``robot``, ``tenant``, ``from_key``, ``store``, ``cloud`` and ``name``.
+        request: The robot, its earlier key and the store.
+        tenant: Of the robot.
         settings: Group data, for the store.
         roster: The robot is who is enrolled there under its name now, or else who has tokens of the platform.
 
@@ -55,10 +73,10 @@ def run_adopt(args: argparse.Namespace, settings: PlatformSettings, roster: Rost
         UsageError: The store belongs to another process.
         StoreError: The store failed in between; the same command continues.
     """
-    enrolled = roster.find(args.tenant, args.robot)
-    robot = RobotId(args.tenant, args.robot) if enrolled is None else enrolled.id
-    source = robot._replace(enrolment=_thumbprint(args.from_key))
-    adopted = adopt(_open_store(args, settings), robot, source=source)
+    enrolled = roster.find(tenant, request.robot)
+    robot = RobotId(tenant, request.robot) if enrolled is None else enrolled.id
+    source = robot._replace(enrolment=_thumbprint(request.from_key))
+    adopted = adopt(_open_store(request, settings), robot, source=source)
     show(
         f"{described(robot.name, robot.tenant)} has {counted(adopted.objects, 'object')} more, "
         f"{counted(adopted.object_bytes, 'byte')}, and "
@@ -79,16 +97,16 @@ def _thumbprint(key_id: str) -> str:
     return thumbprint
 
 
-def _open_store(args: argparse.Namespace, settings: PlatformSettings) -> ObjectStore:
-    if args.store is None and not args.cloud and state_folder(args.name, os.environ).is_dir():
-        settings = with_store(None, settings, args.name)
+def _open_store(request: AdoptRequest, settings: PlatformSettings) -> ObjectStore:
+    if request.store is None and not request.cloud and request.folder.is_dir():
+        settings = with_store(None, settings, request.name)
         kind, _, folder = settings.data.store.partition(":")
         if kind == "dir" and not Path(folder).is_dir():
             raise UsageError(
-                f"the platform {args.name!r} of this machine has stored nothing yet",
+                f"the platform {request.name!r} of this machine has stored nothing yet",
                 hint="so there is nothing to adopt; or name another store: --store dir:PATH",
             )
-    location = args.store or settings.data.store
+    location = request.store or settings.data.store
     if location == _PRIVATE_STORE:
         raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
     return open_data_store(settings.replace(data={"store": location}))

@@ -2,39 +2,76 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import secrets
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from rse_pf.auth.tokens import SigningKey
+from rse_pf.cli.access.access_control import RobotRequest
+from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import is_loopback
 from rse_pf.enrolment import Enrolment
 from rse_pf.errors import UsageError
-from rse_pf.local.state import read_state, state_folder
+from rse_pf.local.state import read_state
 
-__all__ = ["enrolment_lines", "make_enrolment"]
+__all__ = ["EnrolRequest", "enrolment_lines", "make_enrolment"]
 
 _SEED_BYTES = 32
 _MAX_BYTES = 65536
 
 
-def make_enrolment(args: argparse.Namespace, settings: PlatformSettings) -> Enrolment:
-    """Return an enrolment with a new key, for the platform that *args* mean.
+@dataclass(frozen=True, kw_only=True)
+class EnrolRequest(RobotRequest):
+    """A robot that is enrolled, with a new key or with its own, and what it may do."""
+
+    out: Path | None = option(
+        "--out", metavar="FILE", help="make a key, and write all that the robot needs to connect to FILE"
+    )
+    url: str | None = option(
+        "--url", help="with --out: where the robot connects (default: the address of the local platform)"
+    )
+    authority: Path | None = option(
+        "--authority",
+        metavar="FILE",
+        help="with --out: certificate (PEM) of the authority to trust (default: the local platform's)",
+    )
+    public_key: Path | None = option(
+        "--public-key",
+        metavar="FILE",
+        help="the public key that keygen printed; - reads standard input",
+    )
+    scope: tuple[str, ...] = option(
+        "--scope",
+        action="append",
+        default=(),
+        metavar="SCOPE",
+        help="allow only this, such as services:pnp or maps:read; repeatable (default: everything)",
+    )
+    quota: tuple[str, ...] = option(
+        "--quota",
+        action="append",
+        default=(),
+        metavar="NAME=N",
+        help="data_bytes=N, the bytes that the robot may store, or data_bytes=default (data.quota_bytes)",
+    )
+
+
+def make_enrolment(request: EnrolRequest, tenant: str, settings: PlatformSettings) -> Enrolment:
+    """Return an enrolment with a new key, for the platform of the request.
 
     Raises:
         UsageError: The address is not known, or the file of the authority cannot be read.
     """
-    url, authority = _place(args)
+    url, authority = _place(request)
     auth = settings.auth
     return Enrolment(
         url=url,
         authority="" if authority is None else _certificate(authority),
-        robot=args.robot,
-        tenant=args.tenant,
+        robot=request.robot,
+        tenant=tenant,
         key=json.loads(SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES)).to_json()),
         audience=auth.audience,
         token_ttl_s=auth.token_ttl_s,
@@ -60,24 +97,24 @@ def enrolment_lines(made: Enrolment, file: Path) -> list[str]:
     return lines
 
 
-def _place(args: argparse.Namespace) -> tuple[str, Path | None]:
+def _place(request: EnrolRequest) -> tuple[str, Path | None]:
     """Return the address, and the file of the authority if there is one."""
-    state = None if args.cloud else read_state(state_folder(args.name, os.environ))
-    url, authority = args.url or (state.url if state is not None else ""), args.authority
+    state = None if request.cloud else read_state(request.folder)
+    url, authority = request.url or (state.url if state is not None else ""), request.authority
     if not url:
-        if args.cloud:
+        if request.cloud:
             raise UsageError(
                 "the address of the deployment is not known here",
                 hint="name it with --url; rse-pf cloud up and status print it",
             )
         raise UsageError(
-            f"platform {args.name!r} does not run, so its address is not known",
+            f"platform {request.name!r} does not run, so its address is not known",
             hint="start it with rse-pf local --lan, or name the address with --url",
         )
     parts = urlsplit(url)
     if parts.scheme not in ("ws", "wss") or not parts.hostname:
         raise UsageError(f"{url[:200]!r} is no address of a platform", hint="write wss://HOST:PORT/ws")
-    if authority is None and not args.url and state is not None and state.authority_file:
+    if authority is None and not request.url and state is not None and state.authority_file:
         authority = Path(state.authority_file)
     return url, authority
 

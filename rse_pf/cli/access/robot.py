@@ -26,9 +26,9 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,167 +45,112 @@ from rse_pf.auth.roster import (
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.access.access_control import (
     NOT_ENROLLED_HINT,
-    add_place,
+    RobotRequest,
+    TenantRequest,
     choose_robot,
     described,
     max_token_s,
-    open_access_control,
     read_quotas,
-    record_action,
     tenant_or_default,
-    which_platform,
 )
-from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
+from rse_pf.cli.access.adopt import AdoptRequest, run_adopt
+from rse_pf.cli.access.enrolment import EnrolRequest, enrolment_lines, make_enrolment
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import format_time, show, show_json
 
-__all__ = ["add_arguments", "run"]
-
-_ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove", "quota", "adopt")
-_ALSO_NOT_ENROLLED = ("disable", "adopt")
-"""Actions that a robot without a key of its own, which uses tokens of the platform, may be named for."""
+__all__ = ["ACTION"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("action", choices=_ACTIONS, help="what to do")
-    parser.add_argument(
-        "robot", nargs="?", metavar="ROBOT", help="name of the robot, as in its tokens and logs"
+@dataclass(frozen=True, kw_only=True)
+class _KeygenRequest:
+    out: Path = option("--out", required=True, metavar="FILE", help="file for the private key")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ListRequest(TenantRequest):
+    json: bool = option("--json", help="print JSON")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DisableRequest(RobotRequest):
+    not_enrolled: bool = option(
+        "--not-enrolled",
+        help="the robot has no key of its own, and uses tokens of rse-pf token issue",
     )
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE",
-        help="keygen: file for the private key; enrol: file with all that the robot needs to connect",
-    )  # fmt: skip
-    parser.add_argument(
-        "--url", help="enrol --out: where the robot connects (default: the address of the local platform)"
-    )
-    parser.add_argument(
-        "--authority", type=Path, metavar="FILE",
-        help="enrol --out: certificate (PEM) of the authority to trust (default: the local platform's)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--public-key",
-        type=Path,
-        metavar="FILE",
-        help="enrol: the public key that keygen printed; - reads standard input",
-    )
-    parser.add_argument(
-        "--scope",
-        action="append",
-        default=[],
-        metavar="SCOPE",
-        help="enrol: allow only this, such as services:pnp or maps:read; repeatable (default: everything)",
-    )
-    parser.add_argument(
+
+
+@dataclass(frozen=True, kw_only=True)
+class _QuotaRequest(RobotRequest):
+    quota: tuple[str, ...] = option(
         "--quota",
         action="append",
-        default=[],
+        required=True,
+        default=(),
         metavar="NAME=N",
-        help="enrol, quota: data_bytes, how much it may store, or default (data.quota_bytes)",
+        help="data_bytes=N, the bytes that the robot may store, or data_bytes=default (data.quota_bytes)",
     )
-    parser.add_argument(
-        "--from-key", default="", metavar="KEY",
-        help="adopt: the id of the robot's earlier key (default: what was stored before keys counted)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--store", help="adopt: dir:PATH or s3:BUCKET (default: data.store, or the local platform's)"
+
+
+def keygen(request: _KeygenRequest, settings: PlatformSettings) -> None:
+    """Make a private key, and print its public half."""
+    from rse_pf.auth.robot_key import make_robot_key
+
+    show(make_robot_key(request.out))
+
+
+def _enrolled_tenant(request: RobotRequest, access: AccessControlStore) -> str:
+    """Return the tenant of an enrolled robot; raises UsageError if there is no such robot."""
+    return choose_robot(
+        request.robot,
+        request.tenant,
+        access.roster().robots,
+        state="enrolled",
+        hint="rse-pf robot list shows which robots are enrolled",
     )
-    parser.add_argument(
-        "--not-enrolled", action="store_true",
-        help="disable, adopt: a robot without a key of its own, which uses tokens of rse-pf token issue",
-    )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="list: as JSON")
-    add_place(parser)
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Do one action."""
-    _check(args)
-    if args.action == "keygen":
-        from rse_pf.auth.robot_key import make_robot_key
-
-        show(make_robot_key(args.out))
-        return 0
-    access, now = open_access_control(args, settings), time.time()
-    if args.action == "list":
-        return _list(args, access)
-    if args.action == "enrol":
-        args.tenant = tenant_or_default(args.tenant)
-        return _enrol(args, access, now, settings)
-    args.tenant = _tenant(args, access)
-    actions = {
-        "adopt": _adopt, "remove": _remove, "disable": _disable, "enable": _enable, "quota": _change_quotas,
-    }  # fmt: skip
-    return actions[args.action](args, access, settings)
+def _tenant(request: _DisableRequest | AdoptRequest, access: AccessControlStore) -> str:
+    """Return the tenant of a robot, enrolled or not; raises UsageError if there is no such robot."""
+    if request.not_enrolled:
+        check_robot(request.robot)
+        return tenant_or_default(request.tenant)
+    robots = access.roster().robots
+    return choose_robot(request.robot, request.tenant, robots, state="enrolled", hint=NOT_ENROLLED_HINT)
 
 
-def _tenant(args: argparse.Namespace, access: AccessControlStore) -> str:
-    """Return the tenant of the robot that *args* mean; raises UsageError if there is no such robot."""
-    if args.not_enrolled:
-        check_robot(args.robot)
-        return tenant_or_default(args.tenant)
-    hint = NOT_ENROLLED_HINT if args.action in _ALSO_NOT_ENROLLED else "rse-pf robot list shows who is"
-    if args.action == "enable":
-        disabled = access.deny_list().disabled
-        return choose_robot(args.robot, args.tenant, disabled, state="disabled", hint=hint)
-    return choose_robot(args.robot, args.tenant, access.roster().robots, state="enrolled", hint=hint)
-
-
-def _check(args: argparse.Namespace) -> None:
-    """Raise UsageError for arguments that the action does not take."""
-    named = args.action not in ("keygen", "list")
-    if named != (args.robot is not None):
-        problem = "needs the name of a robot" if named else "names no robot"
-        raise UsageError(f"rse-pf robot {args.action} {problem}", hint="see rse-pf robot --help")
-    if args.action == "keygen" and args.out is None:
-        raise UsageError("keygen needs --out", hint="for example: --out robot.key")
-    if args.action not in ("keygen", "enrol") and args.out is not None:
-        raise UsageError("--out is for keygen and enrol", hint="see rse-pf robot --help")
-    if args.action != "enrol" and args.public_key is not None:
-        raise UsageError("--public-key is for enrol", hint="see rse-pf robot --help")
-    if args.action == "enrol" and (args.public_key is None) == (args.out is None):
+def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
+    """Enrol a robot with its own key, or with a new one that is written to a file."""
+    if (request.public_key is None) == (request.out is None):
         raise UsageError(
             "enrol needs either --out or --public-key",
             hint="--out FILE makes a key and the file for the robot; --public-key takes what keygen printed",
         )
-    if (args.url or args.authority) and (args.action != "enrol" or args.out is None):
-        raise UsageError("--url and --authority are for enrol --out", hint="see rse-pf robot --help")
-    if args.action != "adopt" and (args.from_key or args.store):
-        raise UsageError("--from-key and --store are for adopt", hint="see rse-pf robot --help")
-    if args.action not in _ALSO_NOT_ENROLLED and args.not_enrolled:
-        raise UsageError("--not-enrolled is for disable and adopt", hint="see rse-pf robot --help")
-    if args.action != "enrol" and args.scope:
-        raise UsageError("--scope is for enrol", hint="enrol the robot again to change its scopes")
-    if (args.action == "quota") > bool(args.quota) or (args.quota and args.action not in ("enrol", "quota")):
-        raise UsageError("--quota is for enrol and for quota, which needs it", hint="--quota data_bytes=1e9")
-
-
-def _enrol(
-    args: argparse.Namespace, access: AccessControlStore, now: float, settings: PlatformSettings
-) -> int:
-    enrolment = None if args.out is None else make_enrolment(args, settings)
+    if (request.url or request.authority) and request.out is None:
+        raise UsageError("--url and --authority are for enrol --out", hint="see rse-pf robot enrol --help")
+    access = request.open_access_control(settings)
+    tenant = tenant_or_default(request.tenant)
+    enrolment = None if request.out is None else make_enrolment(request, tenant, settings)
     robot = EnrolledRobot(
-        robot=args.robot,
-        tenant=args.tenant,
-        x=public_key_of(_text(args.public_key)) if enrolment is None else str(enrolment.key["x"]),
-        scopes=check_scopes(tuple(args.scope)),
-        quotas=read_quotas(args.quota),
-        enrolled_s=round(now, 3),
+        robot=request.robot,
+        tenant=tenant,
+        x=_public_key(request.public_key) if enrolment is None else str(enrolment.key["x"]),
+        scopes=check_scopes(tuple(request.scope)),
+        quotas=read_quotas(request.quota),
+        enrolled_s=round(time.time(), 3),
     )
-    if enrolment is not None:
-        enrolment.write(args.out)
-    before = access.roster().find(args.tenant, args.robot)
+    if enrolment is not None and request.out is not None:
+        enrolment.write(request.out)
+    before = access.roster().find(tenant, request.robot)
     try:
         access.change_roster(lambda roster: roster.enrolled(robot))
     except BaseException:
-        if enrolment is not None:  # a file whose key no platform knows
-            args.out.unlink(missing_ok=True)
+        if request.out is not None:  # a file whose key no platform knows
+            request.out.unlink(missing_ok=True)
         raise
     allowed = " ".join(robot.scopes) or "everything"
-    record_action(
-        args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed
-    )
+    request.record("robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed)
     who = described(robot.robot, robot.tenant)
     show(f"{who} is enrolled with {robot.key_id}; it may use {allowed}")
     if before is not None and before.x != robot.x:
@@ -213,54 +158,64 @@ def _enrol(
             "its earlier key is refused within 2 s; to give it what it stored under that key:  "
             f"rse-pf robot adopt {robot.robot} --from-key {before.key_id} --tenant {robot.tenant}"
         )
-    if enrolment is not None:
-        show(*enrolment_lines(enrolment, args.out))
-    return 0
+    if enrolment is not None and request.out is not None:
+        show(*enrolment_lines(enrolment, request.out))
 
 
-def _adopt(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
-    from rse_pf.cli.access.adopt import run_adopt
-
-    adopted = run_adopt(args, settings, access.roster())
-    record_action(
-        args, settings, "robot.adopted", args.robot, tenant=args.tenant, source=args.from_key,
+def adopt(request: AdoptRequest, settings: PlatformSettings) -> None:
+    """Give a robot what is stored under its earlier identity."""
+    access = request.open_access_control(settings)
+    tenant = _tenant(request, access)
+    adopted = run_adopt(request, tenant, settings, access.roster())
+    request.record(
+        "robot.adopted", request.robot, tenant=tenant, source=request.from_key,
         objects=adopted.objects, snapshots=adopted.snapshots,
     )  # fmt: skip
-    return 0
 
 
-def _remove(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
-    enrolled = access.roster().find(args.tenant, args.robot)
+def remove(request: RobotRequest, settings: PlatformSettings) -> None:
+    """Delete the public key of a robot."""
+    access = request.open_access_control(settings)
+    tenant = _enrolled_tenant(request, access)
+    enrolled = access.roster().find(tenant, request.robot)
     if enrolled is None:  # another operator has just removed it
-        raise UsageError(f"robot {args.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
+        raise UsageError(f"robot {request.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
 
     def without(roster: Roster) -> Roster:
         return Roster(robots=tuple(robot for robot in roster.robots if robot.x != enrolled.x))
 
     access.change_roster(without)
-    record_action(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=enrolled.key_id)
-    who = described(args.robot, args.tenant)
+    request.record("robot.removed", request.robot, tenant=tenant, key=enrolled.key_id)
+    who = described(request.robot, tenant)
     show(f"{who} is removed: tokens signed by {enrolled.key_id} are refused within 2 s")
-    return 0
 
 
-def _disable(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
-    robot, tenant, now = args.robot, args.tenant, time.time()
+def disable(request: _DisableRequest, settings: PlatformSettings) -> None:
+    """Refuse all tokens of a robot until it is enabled again."""
+    access = request.open_access_control(settings)
+    robot, tenant, now = request.robot, _tenant(request, access), time.time()
     longest = max_token_s(settings)
     access.change_deny_list(
         lambda denied: denied.pruned(now=now, max_token_s=longest).with_robot(tenant, robot, now)
     )
-    record_action(args, settings, "robot.disabled", robot, tenant=tenant)
+    request.record("robot.disabled", robot, tenant=tenant)
     who = described(robot, tenant)
     show(
         f"{who} is disabled: its connections end within 2 s, and all its tokens are refused",
-        f"to let it in again:  rse-pf robot enable {robot} --tenant {tenant}{which_platform(args)}",
+        f"to let it in again:  rse-pf robot enable {robot} --tenant {tenant}{request.as_option}",
     )
-    return 0
 
 
-def _enable(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
-    robot, tenant, now = args.robot, args.tenant, time.time()
+def enable(request: RobotRequest, settings: PlatformSettings) -> None:
+    """Accept the tokens of a disabled robot again."""
+    access, robot, now = request.open_access_control(settings), request.robot, time.time()
+    tenant = choose_robot(
+        robot,
+        request.tenant,
+        access.deny_list().disabled,
+        state="disabled",
+        hint="rse-pf robot list shows which robots are disabled",
+    )
     longest, from_s = max_token_s(settings), float(int(now))
 
     def enabled(denied: DenyList) -> DenyList:
@@ -268,30 +223,31 @@ def _enable(args: argparse.Namespace, access: AccessControlStore, settings: Plat
         return remaining.with_tokens_before(tenant, robot, from_s)
 
     access.change_deny_list(enabled)
-    record_action(args, settings, "robot.enabled", robot, tenant=tenant)
+    request.record("robot.enabled", robot, tenant=tenant)
     show(f"{described(robot, tenant)} is enabled again, for tokens issued since {format_time(from_s)}")
-    return 0
 
 
-def _text(path: Path) -> str:
-    if str(path) == "-":
-        return sys.stdin.read()
+def _public_key(path: Path | None) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        text = sys.stdin.read() if path is None or str(path) == "-" else path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(
             f"cannot read {path}", hint="name the file with the public key that keygen printed"
         ) from error
+    return public_key_of(text)
 
 
-def _change_quotas(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
-    quotas = read_quotas(args.quota)
+def set_quota(request: _QuotaRequest, settings: PlatformSettings) -> None:
+    """Set what a robot may store."""
+    access = request.open_access_control(settings)
+    tenant = _enrolled_tenant(request, access)
+    quotas = read_quotas(request.quota)
 
     def changed(roster: Roster) -> Roster:
         return Roster(
             robots=tuple(
                 msgspec.structs.replace(robot, quotas=quotas)
-                if (robot.tenant, robot.robot) == (args.tenant, args.robot)
+                if (robot.tenant, robot.robot) == (tenant, request.robot)
                 else robot
                 for robot in roster.robots
             )
@@ -299,12 +255,13 @@ def _change_quotas(args: argparse.Namespace, access: AccessControlStore, setting
 
     access.change_roster(changed)
     limit = f"{quotas['data_bytes']:.0f} bytes" if quotas else "what data.quota_bytes says"
-    record_action(args, settings, "robot.quota", args.robot, tenant=args.tenant, limit=limit)
-    show(f"{described(args.robot, args.tenant)} may store {limit}; all servers know it within 2 s")
-    return 0
+    request.record("robot.quota", request.robot, tenant=tenant, limit=limit)
+    show(f"{described(request.robot, tenant)} may store {limit}; all servers know it within 2 s")
 
 
-def _list(args: argparse.Namespace, access: AccessControlStore) -> int:
+def list_robots(request: _ListRequest, settings: PlatformSettings) -> None:
+    """Show the robots that are enrolled or disabled."""
+    access = request.open_access_control(settings)
     roster, denied = access.roster(), access.deny_list()
     rows = [_row(robot, denied) for robot in roster.robots]
     for entry in denied.disabled:
@@ -318,18 +275,17 @@ def _list(args: argparse.Namespace, access: AccessControlStore) -> int:
                     "scopes": [],
                 }
             )
-    rows = [row for row in rows if args.tenant in (None, row["tenant"])]
+    rows = [row for row in rows if request.tenant in (None, row["tenant"])]
     rows.sort(key=lambda row: row["tenant"])
-    if args.json:
+    if request.json:
         show_json(rows, indent=2)
-        return 0
+        return
     for row in rows:
         columns = (row["tenant"], row["robot"], row["state"], row["key"], " ".join(row["scopes"]))
         show("  ".join(columns).rstrip())
     if not rows:
-        where = "" if args.tenant is None else f" in tenant {args.tenant!r}"
+        where = "" if request.tenant is None else f" in tenant {request.tenant!r}"
         show(f"no robot is enrolled or disabled{where}; other robots use tokens of rse-pf token issue")
-    return 0
 
 
 def _row(robot: EnrolledRobot, denied: DenyList) -> dict[str, Any]:
@@ -343,3 +299,57 @@ def _row(robot: EnrolledRobot, denied: DenyList) -> dict[str, Any]:
         "quotas": robot.quotas,
         "enrolled_s": robot.enrolled_s,
     }
+
+
+ACTION = Action(
+    actions={
+        "keygen": Action(
+            help="make a private key on the robot, and print the public half",
+            example="rse-pf robot keygen --out robot.key > robot.json",
+            request=_KeygenRequest,
+            run=keygen,
+        ),
+        "enrol": Action(
+            help="enrol a robot with a key of its own",
+            example="rse-pf robot enrol robot-2 --out robot-2.enrolment",
+            request=EnrolRequest,
+            run=enrol,
+        ),
+        "list": Action(
+            help="show the robots that are enrolled or disabled",
+            example="rse-pf robot list",
+            request=_ListRequest,
+            run=list_robots,
+        ),
+        "disable": Action(
+            help="refuse all tokens of a robot until it is enabled",
+            example="rse-pf robot disable robot-1",
+            request=_DisableRequest,
+            run=disable,
+        ),
+        "enable": Action(
+            help="accept the tokens of a disabled robot again",
+            example="rse-pf robot enable robot-1",
+            request=RobotRequest,
+            run=enable,
+        ),
+        "remove": Action(
+            help="delete the public key of a robot",
+            example="rse-pf robot remove robot-1",
+            request=RobotRequest,
+            run=remove,
+        ),
+        "quota": Action(
+            help="set the bytes that a robot may store",
+            example="rse-pf robot quota robot-1 --quota data_bytes=5e9",
+            request=_QuotaRequest,
+            run=set_quota,
+        ),
+        "adopt": Action(
+            help="give a robot what is stored under its earlier identity",
+            example="rse-pf robot adopt robot-1",
+            request=AdoptRequest,
+            run=adopt,
+        ),
+    },
+)

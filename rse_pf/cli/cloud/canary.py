@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import secrets
 import time
 
+from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _SEED_BYTES = 32
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare nothing: the canary has no options."""
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def renew_canary_key(request: NoOptions, settings: PlatformSettings) -> int:
     """Write the private key into the canary's secret and the public one into the roster; return 0."""
     from rse_pf.auth.roster import SYNTHETIC, EnrolledRobot
     from rse_pf.auth.tokens import SigningKey
@@ -41,3 +37,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     access.change_roster(lambda roster: roster.enrolled(robot))
     show(f"{names.canary} has a new key and the scopes {' '.join(scopes)}; servers know it in a few seconds")
     return 0
+
+
+ACTION = Action(help="give the canary a new key, and enrol it", request=NoOptions, run=renew_canary_key)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -14,13 +14,14 @@ from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.plan import Step
 from rse_pf.aws.money.costs import HOURS, Bill, bill_of, parked
 from rse_pf.aws.money.prices import Prices, operators_prices
+from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
 
 __all__ = [
+    "ChangeRequest",
     "DeploymentCosts",
-    "add_yes",
     "confirmed",
     "deployment_costs",
     "make_tools",
@@ -30,9 +31,12 @@ __all__ = [
 ]
 
 
-def add_yes(parser: argparse.ArgumentParser) -> None:
-    """Declare the option of scripts that answer no questions."""
-    parser.add_argument("--yes", action="store_true", help="do it without asking")
+@dataclass(frozen=True, kw_only=True)
+class ChangeRequest:
+    """A change of the deployment, and whether it needs no confirmation."""
+
+    settings: Path | None = None
+    yes: bool = option("--yes", help="do not ask for a confirmation")
 
 
 class DeploymentCosts:
@@ -63,10 +67,10 @@ def deployment_costs(settings: PlatformSettings) -> DeploymentCosts:
     return DeploymentCosts(settings, operators_prices(None, Path.cwd()))
 
 
-def make_tools(account: Account, settings: PlatformSettings, args: argparse.Namespace) -> CdkTools:
+def make_tools(account: Account, settings: PlatformSettings, request: ChangeRequest) -> CdkTools:
     """Return the tools of the checkout in the working folder; tests put others in their place."""
     caller = account.find("sts", "get_caller_identity") or {}
-    return CdkTools(Path.cwd(), settings, str(caller.get("Account", "")), args.settings)
+    return CdkTools(Path.cwd(), settings, str(caller.get("Account", "")), request.settings)
 
 
 def open_world(account: Account, settings: PlatformSettings, tools: CdkTools) -> StepContext:
@@ -80,9 +84,9 @@ def show_steps(steps: Sequence[Step]) -> None:
     show(*(f"  {at}. {step}" for at, step in enumerate(steps, 1)))
 
 
-def confirmed(args: argparse.Namespace, question: str = "go on?") -> bool:
+def confirmed(request: ChangeRequest, question: str = "go on?") -> bool:
     """Return whether the operator agrees; raises UsageError where nobody can be asked."""
-    if args.yes:
+    if request.yes:
         return True
     if not sys.stdin.isatty():
         raise UsageError("nobody can be asked here", hint="read the plan above, then add --yes")

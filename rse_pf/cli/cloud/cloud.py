@@ -12,42 +12,35 @@ examples:
 
 from __future__ import annotations
 
-import argparse
-import importlib
-from typing import Any
+from rse_pf.cli.cloud import (
+    canary,
+    cost,
+    doctor,
+    down,
+    leftovers,
+    logs,
+    park,
+    resume,
+    status,
+    up,
+    upgrade,
+)  # fmt: skip
+from rse_pf.command_line.options import Action
 
-from rse_pf.config import PlatformSettings
+__all__ = ["ACTION"]
 
-__all__ = ["ACTIONS", "add_arguments", "run"]
-
-ACTIONS = {
-    "up": "put the platform up, bring it up to date, or finish what was begun",
-    "upgrade": "replace the servers by those of the newest deployment, one by one, or return to the old ones",
-    "park": "end all servers until resume; the data and the load balancer stay",
-    "resume": "end parking, with as many servers as before",
-    "down": "destroy the platform, and prove that nothing is left but what is kept",
-    "doctor": "check tools, packages, account, certificate and quotas before a deployment",
-    "cost": "what a load costs a month, line by line, on the fleet and on the Lambda",
-    "status": "servers, their health, alarms, robots",
-    "logs": "what a server logged, also one that is gone, and what a failed boot wrote",
-    "canary": "give the canary a new key, and enrol it",
-    "leftovers": "resources in the account that belong to no stack",
-}
-"""Action and one line of help.  Each is a module of this folder, with ``add_arguments`` and ``run``."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for name, text in ACTIONS.items():
-        _module(name).add_arguments(actions.add_parser(name, help=text, description=text))
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Run one action and return the exit code; 1 means that the operator has to act."""
-    code: int = _module(args.action).run(args, settings)
-    return code
-
-
-def _module(action: str) -> Any:
-    return importlib.import_module(f"rse_pf.cli.cloud.{action}")
+ACTION = Action(
+    actions={
+        "up": up.ACTION,
+        "upgrade": upgrade.ACTION,
+        "park": park.ACTION,
+        "resume": resume.ACTION,
+        "down": down.ACTION,
+        "doctor": doctor.ACTION,
+        "cost": cost.ACTION,
+        "status": status.ACTION,
+        "logs": logs.ACTION,
+        "canary": canary.ACTION,
+        "leftovers": leftovers.ACTION,
+    }
+)

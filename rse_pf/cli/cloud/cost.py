@@ -2,50 +2,54 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
 from rse_pf.aws.money.costs import Bill, Load
 from rse_pf.aws.money.prices import Prices
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import counted, show
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _MAX_ROBOTS = 1_000_000
 _MAX_FPS = 1000
 _MAX_BURST = 1e9
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the load, and the file of prices."""
-    parser.add_argument("--robots", type=int, default=10, metavar="N", help="default: %(default)s")
-    parser.add_argument(
-        "--fps", type=float, default=5.0, metavar="F", help="frames a second of each (default: %(default)s)"
+@dataclass(frozen=True, kw_only=True)
+class CostRequest:
+    """A load, and the prices by which it is charged."""
+
+    robots: int = option("--robots", default=10, metavar="N", help="number of robots (default: %(default)s)")
+    fps: float = option(
+        "--fps", default=5.0, metavar="F", help="frames per second of each robot (default: %(default)s)"
     )
-    parser.add_argument(
-        "--hours-per-day", type=float, default=24.0, metavar="H", help="hours at work (default: %(default)s)"
+    hours_per_day: float = option(
+        "--hours-per-day", default=24.0, metavar="H", help="hours at work (default: %(default)s)"
     )
-    parser.add_argument(
-        "--burst", type=float, default=0.0, metavar="N",
-        help="commands a day that the Lambda answers beside the fleet (default: none)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--prices", type=Path, metavar="FILE", help="JSON file of prices to use in place of ours, all or some"
+    burst: float = option(
+        "--burst",
+        default=0.0,
+        metavar="N",
+        help="commands a day that the Lambda answers in addition to the fleet (default: none)",
+    )
+    prices: Path | None = option(
+        "--prices", metavar="FILE", help="JSON file of prices that replace all or some of ours"
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_costs(request: CostRequest, settings: PlatformSettings) -> int:
     """Print the bill and what other ways to run the platform would cost, and return 0."""
     from rse_pf.aws.money.costs import NOT_INCLUDED, bill_of
     from rse_pf.aws.money.prices import operators_prices
 
-    load = _load(args)
-    prices = operators_prices(args.prices, Path.cwd())
+    load = _load(request)
+    prices = operators_prices(request.prices, Path.cwd())
     bill = bill_of(settings, prices, load)
     show(
         f"{counted(load.robots, 'robot')}, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
@@ -62,30 +66,30 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def _load(args: argparse.Namespace) -> Load:
+def _load(request: CostRequest) -> Load:
     """Return the load that the options describe; raises UsageError."""
-    if not 1 <= args.robots <= _MAX_ROBOTS:
+    if not 1 <= request.robots <= _MAX_ROBOTS:
         raise UsageError(
-            f"--robots {args.robots} is not within 1..{_MAX_ROBOTS}", hint="name how many robots there are"
+            f"--robots {request.robots} is not within 1..{_MAX_ROBOTS}", hint="name how many robots there are"
         )
-    if not (math.isfinite(args.fps) and 0 < args.fps <= _MAX_FPS):
+    if not (math.isfinite(request.fps) and 0 < request.fps <= _MAX_FPS):
         raise UsageError(
-            f"--fps {args.fps:g} is not within 0..{_MAX_FPS}", hint="name frames per second, such as 5"
+            f"--fps {request.fps:g} is not within 0..{_MAX_FPS}", hint="name frames per second, such as 5"
         )
-    if not 0 < args.hours_per_day <= 24:
+    if not 0 < request.hours_per_day <= 24:
         raise UsageError(
-            f"--hours-per-day {args.hours_per_day:g} is not within 0..24", hint="24 is all day and night"
+            f"--hours-per-day {request.hours_per_day:g} is not within 0..24", hint="24 is all day and night"
         )
-    if not 0 <= args.burst <= _MAX_BURST:
+    if not 0 <= request.burst <= _MAX_BURST:
         raise UsageError(
-            f"--burst {args.burst:g} is not within 0..{_MAX_BURST:g}",
+            f"--burst {request.burst:g} is not within 0..{_MAX_BURST:g}",
             hint="name commands a day, such as 5000",
         )
     return Load(
-        robots=args.robots,
-        fps=args.fps,
-        hours_per_day=args.hours_per_day,
-        burst_commands_per_day=args.burst,
+        robots=request.robots,
+        fps=request.fps,
+        hours_per_day=request.hours_per_day,
+        burst_commands_per_day=request.burst,
     )
 
 
@@ -144,3 +148,10 @@ def _show_alternatives(bill: Bill, settings: PlatformSettings, prices: Prices, l
         show("the fleet needs more than scaling.max_servers: robots would be refused")
     if executions > concurrency:
         show("the Lambda alone needs more than cloud.lambda_concurrency: robots would be refused")
+
+
+ACTION = Action(
+    help="what a load costs a month, line by line, on the fleet and on the Lambda",
+    request=CostRequest,
+    run=show_costs,
+)

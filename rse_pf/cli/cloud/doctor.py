@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
@@ -16,10 +15,11 @@ from pathlib import Path
 
 from rse_pf.aws.lifecycle.cdk_tools import PACKAGES, are_packages_built
 from rse_pf.cli.doctor import Finding, report
+from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 
-__all__ = ["NO_PACKAGES", "add_arguments", "check_tools", "run"]
+__all__ = ["ACTION", "NO_PACKAGES", "check_tools"]
 
 NO_PACKAGES = "no packages"
 """What a finding says for which `rse-pf cloud up` has a step."""
@@ -30,11 +30,7 @@ _PINNED = Path("package.json")
 _SCHEMA = "@aws-cdk/cloud-assembly-schema"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare nothing: the action has no options."""
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def check_deployment(request: NoOptions, settings: PlatformSettings) -> int:
     """Print one line for each finding; return 1 if one has to be fixed first."""
     findings = itertools.chain(check_tools(Path.cwd()), _account_findings(settings))
     return report(findings, "ready: rse-pf cloud up")
@@ -100,3 +96,10 @@ def _cli(checkout: Path) -> Finding:
     if version != pinned:
         return Finding(grade="warn", what=f"{line}; package.json pins {pinned}", fix=fix)
     return Finding(grade="ok", what=line)
+
+
+ACTION = Action(
+    help="check tools, packages, account, certificate and quotas before a deployment",
+    request=NoOptions,
+    run=check_deployment,
+)

@@ -2,53 +2,55 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.proof import Proof, prove
 from rse_pf.cli.cloud import changing
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.terminal import counted, show
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _LISTED_LATE_S = 60.0
 """The tagging service of AWS may still list for this long what is gone."""
 _POLL_S = 5.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what becomes of the data, and the options of scripts."""
-    parser.add_argument(
-        "--delete-data", action="store_true",
-        help="delete maps, packages, logs and the signing key, too, as far as object lock allows",
-    )  # fmt: skip
-    parser.add_argument(
+@dataclass(frozen=True, kw_only=True)
+class DownRequest(changing.ChangeRequest):
+    """Whether the data of the deployment is deleted, too."""
+
+    delete_data: bool = option(
+        "--delete-data",
+        help="also delete maps, packages, logs and the signing key, as far as object lock allows",
+    )
+    confirm: str = option(
         "--confirm", default="", metavar="NAME", help="the name that --delete-data asks for, in a script"
     )
-    changing.add_yes(parser)
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def take_down(request: DownRequest, settings: PlatformSettings) -> int:
     """Take the platform down; return 1 if something is left that nobody keeps, or the answer is no."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.lifecycle.deployment import read_deployment
     from rse_pf.aws.lifecycle.plan import plan_down
 
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
-    plan = plan_down(read_deployment(account, settings), delete_data=args.delete_data)
+    plan = plan_down(read_deployment(account, settings), delete_data=request.delete_data)
     changing.show_steps(plan)
     costs = changing.deployment_costs(settings)
     show(f"it cost {costs.line(costs.running)}, and more with robots", *costs.warnings(settings))
     _show_kept(prove(account, names, costs.prices, now=datetime.now(timezone.utc)), is_over=False)
-    if not changing.confirmed(args) or (args.delete_data and not _confirmed_twice(args, names)):
+    if not changing.confirmed(request) or (request.delete_data and not _confirmed_twice(request, names)):
         return 1
-    tools = changing.make_tools(account, settings, args)
+    tools = changing.make_tools(account, settings, request)
     changing.perform(plan, changing.open_world(account, settings, tools))
     proof = _last_proof(account, names, costs)
     _show_kept(proof, is_over=True)
@@ -58,12 +60,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 1 if proof.left else 0
 
 
-def _confirmed_twice(args: argparse.Namespace, names: ResourceNames) -> bool:
+def _confirmed_twice(request: DownRequest, names: ResourceNames) -> bool:
     """Return whether the operator names the deployment whose data is to be deleted."""
-    if args.confirm:
-        if args.confirm != names.prefix:
+    if request.confirm:
+        if request.confirm != names.prefix:
             raise UsageError(
-                f"--confirm {args.confirm} is not the name of this deployment", hint=f"it is {names.prefix}"
+                f"--confirm {request.confirm} is not the name of this deployment",
+                hint=f"it is {names.prefix}",
             )
         return True
     if not sys.stdin.isatty():
@@ -98,3 +101,10 @@ def _show_kept(proof: Proof, *, is_over: bool) -> None:
         show(f"{verb}  {resource.kind}  {resource.name}{size}, {resource.per_month:.2f} a month")
     if proof.kept:
         show(f"together {proof.per_month:.2f} a month")
+
+
+ACTION = Action(
+    help="destroy the platform, and prove that nothing is left but what is kept",
+    request=DownRequest,
+    run=take_down,
+)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-
+from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import StoreError
 from rse_pf.terminal import show, show_error
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _FAILED = 2
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare nothing: the action has no options."""
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_leftovers(request: NoOptions, settings: PlatformSettings) -> int:
     """Print what is left over; return 1 if anything is, 2 if AWS could not be asked."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.cloudformation import list_living_stacks
@@ -37,3 +32,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     unread = sum(leftover.unread for leftover in leftovers)
     show(f"{len(leftovers) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
     return 1 if leftovers else 0
+
+
+ACTION = Action(
+    help="resources in the account that belong to no stack", request=NoOptions, run=show_leftovers
+)

@@ -2,57 +2,67 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from datetime import datetime, timezone
 
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.terminal import counted, show
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _MAX_LINES = 100_000
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the server and how much of it is shown."""
-    parser.add_argument(
-        "server", nargs="?", metavar="SERVER", help="instance id; without it the servers with journals"
+@dataclass(frozen=True, kw_only=True)
+class LogsRequest:
+    """The server whose log is shown, and how much of it."""
+
+    server: str | None = option(
+        nargs="?", metavar="SERVER", help="instance id; without it the servers with journals are listed"
     )
-    parser.add_argument("--lines", type=int, default=200, metavar="N", help="newest lines (default: 200)")
-    parser.add_argument(
-        "--console", action="store_true", help="what the machine wrote to its console, such as a failed boot"
-    )
+    lines: int = option("--lines", default=200, metavar="N", help="newest lines (default: 200)")
+    console: bool = option("--console", help="show the console of the machine, for example of a failed boot")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_logs(request: LogsRequest, settings: PlatformSettings) -> int:
     """Print lines, or the servers that have some; return 1 if there are none."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.server_logs import console_of, last_lines, list_logged_servers, open_journals
 
-    if not 1 <= args.lines <= _MAX_LINES:
-        raise UsageError(f"--lines {args.lines} is not within 1..{_MAX_LINES}", hint="name how many lines")
-    if args.console and args.server is None:
+    if not 1 <= request.lines <= _MAX_LINES:
+        raise UsageError(f"--lines {request.lines} is not within 1..{_MAX_LINES}", hint="name how many lines")
+    if request.console and request.server is None:
         raise UsageError("--console needs a server", hint="name one: rse-pf cloud logs lists them")
     account = open_account(settings.cloud.region)
-    if args.console:
-        lines = console_of(account, args.server)
+    if request.console and request.server is not None:
+        lines = console_of(account, request.server)
     else:
         store = open_journals(account, ResourceNames(settings.cloud.name))
         servers = list_logged_servers(store)
-        if args.server is None:
+        if request.server is None:
             for server in servers:
                 newest = datetime.fromtimestamp(server.newest_s, timezone.utc)
                 show(f"{server.name}  {newest:%Y-%m-%d %H:%M:%S} UTC  {counted(len(server.pieces), 'piece')}")
             if not servers:
                 show("no server has sent its journals; they come every minute")
             return 0 if servers else 1
-        matching = [server for server in servers if server.name == args.server]
+        matching = [server for server in servers if server.name == request.server]
         # A boot that failed early shipped nothing, and its console is all that there is.
-        lines = last_lines(store, matching[0], args.lines) if matching else console_of(account, args.server)
+        lines = (
+            last_lines(store, matching[0], request.lines) if matching else console_of(account, request.server)
+        )
     if not lines:
-        show(f"{args.server} has sent no journals, and AWS has no console of it")
+        show(f"{request.server} has sent no journals, and AWS has no console of it")
         return 1
-    show(*lines[-args.lines :])
+    show(*lines[-request.lines :])
     return 0
+
+
+ACTION = Action(
+    help="what a server logged, also one that is gone, and what a failed boot wrote",
+    request=LogsRequest,
+    run=show_logs,
+)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 from datetime import datetime, timezone
 
 from rse_pf.aws.lifecycle.deployment import Deployment
 from rse_pf.aws.money.costs import HOURS
 from rse_pf.cli.cloud import changing
+from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.terminal import counted, show
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare nothing: the action has no options."""
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_status(request: NoOptions, settings: PlatformSettings) -> int:
     """Print the state of the deployment; return 1 if it is not healthy."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.group import read_group
@@ -70,3 +66,6 @@ def _show_stage(deployment: Deployment, settings: PlatformSettings) -> None:
         show("costs nothing but stored data: rse-pf cloud down lists it")
     if deployment.url and note is None:
         show(deployment.url)
+
+
+ACTION = Action(help="servers, their health, alarms, robots", request=NoOptions, run=show_status)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,26 +9,22 @@ from rse_pf.aws.account import Account
 from rse_pf.cli.cloud import changing
 from rse_pf.cli.cloud.doctor import NO_PACKAGES, check_tools
 from rse_pf.cli.doctor import Finding
+from rse_pf.command_line.options import Action
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import parks_when_idle
 from rse_pf.terminal import show
 
-__all__ = ["add_arguments", "finish", "run", "show_failed_checks"]
+__all__ = ["ACTION", "finish", "show_failed_checks"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the option of scripts."""
-    changing.add_yes(parser)
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def bring_up(request: changing.ChangeRequest, settings: PlatformSettings) -> int:
     """Put the platform up; return 1 if something has to be fixed first, or the operator does not agree."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.lifecycle.deployment import read_deployment
     from rse_pf.aws.lifecycle.plan import plan_up
 
     account = open_account(settings.cloud.region)
-    tools = changing.make_tools(account, settings, args)
+    tools = changing.make_tools(account, settings, request)
     plan = plan_up(read_deployment(account, settings), has_packages=tools.has_packages)
     if show_failed_checks(account, settings):
         return 1
@@ -37,7 +32,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     costs = changing.deployment_costs(settings)
     show(f"it then costs {costs.line(costs.running)}, and more with robots: rse-pf cloud cost")
     show(*costs.warnings(settings))
-    if not changing.confirmed(args):
+    if not changing.confirmed(request):
         return 1
     changing.perform(plan, changing.open_world(account, settings, tools))
     return finish(account, settings)
@@ -82,3 +77,10 @@ def _findings(account: Account, settings: PlatformSettings) -> Iterator[Finding]
     for check in check_account(account, settings):
         if not check.what.startswith(NOT_BOOTSTRAPPED):
             yield Finding(grade=check.grade, what=check.what, fix=check.fix)
+
+
+ACTION = Action(
+    help="put the platform up, bring it up to date, or finish what was begun",
+    request=changing.ChangeRequest,
+    run=bring_up,
+)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from datetime import datetime, timezone
 
+from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.terminal import show
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare nothing: the action has no options."""
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def upgrade_servers(request: NoOptions, settings: PlatformSettings) -> int:
     """Follow the replacement of the servers; return 1 if it was taken back or failed."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.upgrade import upgrade
@@ -37,3 +33,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return 1
     show(f"all servers run version {ended.version}" + ("" if ended.replaced else ", as before"))
     return 0
+
+
+ACTION = Action(
+    help="replace the servers by those of the newest deployment, one by one, or return to the old ones",
+    request=NoOptions,
+    run=upgrade_servers,
+)

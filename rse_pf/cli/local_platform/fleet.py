@@ -14,65 +14,71 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import os
+from dataclasses import dataclass
 
 from rse_pf.cli.local_platform.local import DEFAULT_NAME
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _MAX_PORT = 65535
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--name", default=DEFAULT_NAME, help=f"name of the platform (default: {DEFAULT_NAME})"
-    )
-    parser.add_argument("--operate", action="store_true", help="the page may operate the platform")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
-    parser.add_argument(
-        "--port", type=int, metavar="PORT", help="with --cloud: port on loopback (default: a free one)"
+@dataclass(frozen=True, kw_only=True)
+class FleetRequest:
+    """The platform whose page is shown, and whether the page may operate it."""
+
+    name: str = option("--name", default=DEFAULT_NAME, help=f"name of the platform (default: {DEFAULT_NAME})")
+    operate: bool = option("--operate", help="the page may operate the platform")
+    json: bool = option("--json", help="print JSON")
+    cloud: bool = option("--cloud", help="show the deployment on AWS in cloud.region")
+    port: int | None = option(
+        "--port", metavar="PORT", help="with --cloud: port on loopback (default: a free one)"
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def show_page_address(request: FleetRequest, settings: PlatformSettings) -> int:
     """Print the address; with --cloud, serve the page until a signal."""
-    if args.cloud:
-        return _run_cloud(args, settings)
-    if args.port is not None:
+    if request.cloud:
+        return _run_cloud(request, settings)
+    if request.port is not None:
         raise UsageError("--port is for --cloud", hint="the port of a local page: local.page_port")
     require("fleet")
     from rse_pf.cli.local_platform.page import new_address
     from rse_pf.local.state import state_folder
 
-    url = new_address(state_folder(args.name, os.environ), "operate" if args.operate else "view")
-    if args.json:
+    url = new_address(state_folder(request.name, os.environ), "operate" if request.operate else "view")
+    if request.json:
         show_json({"url": url})
     else:
         show(f"fleet page  {url}", "the key works once, within an hour")
     return 0
 
 
-def _run_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def _run_cloud(request: FleetRequest, settings: PlatformSettings) -> int:
     require("fleet --cloud")
     from rse_pf.aws.account import open_account
     from rse_pf.extensions.fleet_page.cloud_page import serve_cloud_page
 
-    if args.operate:
+    if request.operate:
         raise UsageError("--operate is for a local platform", hint="see docs/operations.md")
-    if args.port is not None and not 0 <= args.port <= _MAX_PORT:
-        raise UsageError(f"--port {args.port} is not within 0..{_MAX_PORT}", hint="0 takes a free one")
+    if request.port is not None and not 0 <= request.port <= _MAX_PORT:
+        raise UsageError(f"--port {request.port} is not within 0..{_MAX_PORT}", hint="0 takes a free one")
 
     def ready(url: str) -> None:
-        if args.json:
+        if request.json:
             show_json({"url": url})
         else:
             show(f"fleet page  {url}", "the key works once, within an hour; Ctrl-C ends the page")
 
-    return serve_cloud_page(open_account(settings.cloud.region), settings, port=args.port or 0, ready=ready)
+    return serve_cloud_page(
+        open_account(settings.cloud.region), settings, port=request.port or 0, ready=ready
+    )
+
+
+ACTION = Action(request=FleetRequest, run=show_page_address)

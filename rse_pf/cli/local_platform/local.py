@@ -26,155 +26,229 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import functools
 import math
 import os
 import signal
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rse_pf.cli.local_platform.logs import (
+    LogFilter,
+    LogFollower,
+    LogLine,
+    event_document,
+    format_event,
+    format_line,
+    last_lines,
+    line_document,
+    local_time,
+    log_files,
+    since_time_s,
+)
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import HealthSettings, PlatformSettings
 from rse_pf.config.resource_names import ROBOTS_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
 
-__all__ = ["DEFAULT_NAME", "add_arguments", "run"]
+if TYPE_CHECKING:
+    from rse_pf.local.state import PlatformState
+
+__all__ = ["ACTION", "DEFAULT_NAME", "PlatformRequest"]
 
 DEFAULT_NAME = "default"
 # Port on loopback of the burst function, unless --burst names another one.
 _BURST_PORT = 8702
-_FAULTS = ("kill", "pause", "resume", "slow", "partition")
-_OF_A_SERVER = (*_FAULTS, "drain")
-_OF_LOGS = ("logs", "events")
-_ACTIONS = ("start", "stop", "status", "robots", *_OF_LOGS, "drain", "roll", *_FAULTS, "kill-balancer")
 _LINES = 100
 _FOLLOW_S = 0.2
 _SAMPLE_S = 0.5
 _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    defaults = PlatformSettings().local
-    parser.add_argument(
-        "action", nargs="?", choices=_ACTIONS, default="start", metavar="ACTION",
-        help=f"what to do: {', '.join(_ACTIONS)} (default: start)",
-    )  # fmt: skip
-    parser.add_argument(
-        "server", nargs="?", metavar="SERVER", help="the server to drain, kill, pause, resume, slow, ..."
-    )
-    parser.add_argument("--json", action="store_true", help="status, robots, logs, events: as JSON")
-    parser.add_argument(
-        "--for", dest="for_s", type=float, metavar="S",
-        help="pause, slow, partition: end after S seconds (without: pause stays, the others end with Ctrl-C)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--percent", type=float, metavar="P", help="slow: leave the server P %% of its CPU time"
-    )
-    parser.add_argument(
+_DEFAULTS = PlatformSettings().local
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlatformRequest:
+    """A platform on this machine."""
+
+    name: str = option(
         "--name", default=DEFAULT_NAME, help=f"name of the platform, if several run (default: {DEFAULT_NAME})"
     )
-    parser.add_argument(
-        "--servers", type=int, metavar="N",
-        help=f"backend servers at the start (local.servers, default {defaults.servers})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--port", type=int, metavar="P",
-        help=f"port that robots connect to; 0 takes a free one (local.port, default {defaults.port})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--lan", nargs="?", const="", metavar="ADDRESS",
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the state of the platform; raises UsageError for a name that is none."""
+        from rse_pf.local.state import state_folder
+
+        return state_folder(self.name, os.environ)
+
+    def read_state(self) -> PlatformState:
+        """Return the state of the platform; raises UsageError if it does not run."""
+        from rse_pf.local.state import read_state
+
+        state = read_state(self.folder)
+        if state is None:
+            raise UsageError(f"platform {self.name!r} is not running", hint="start it with: rse-pf local")
+        return state
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StartRequest(PlatformRequest):
+    servers: int | None = option(
+        "--servers",
+        metavar="N",
+        help=f"backend servers at the start (local.servers, default {_DEFAULTS.servers})",
+    )
+    port: int | None = option(
+        "--port",
+        metavar="P",
+        help=f"port that robots connect to; 0 takes a free one (local.port, default {_DEFAULTS.port})",
+    )
+    lan: str | None = option(
+        "--lan",
+        nargs="?",
+        const="",
+        metavar="ADDRESS",
         help="listen on ADDRESS of this machine (default: a detected one) with TLS, for other machines",
-    )  # fmt: skip
-    parser.add_argument(
-        "--metrics-port", type=int, metavar="P",
+    )
+    metrics_port: int | None = option(
+        "--metrics-port",
+        metavar="P",
         help="port on loopback of the metrics of all servers; 0 takes a free one (local.metrics_port, "
-        f"default {defaults.metrics_port})",
-    )  # fmt: skip
-    logs = parser.add_argument_group("logs and events")
-    logs.add_argument("--server", dest="of_server", metavar="ID", help="of this process only")
-    logs.add_argument("--follow", action="store_true", help="go on with new lines until Ctrl-C")
-    logs.add_argument(
-        "--since", metavar="TIME", help='all lines of the last 90s, 5m, 2h or 1d, or since "2026-03-01 14:30"'
+        f"default {_DEFAULTS.metrics_port})",
     )
-    logs.add_argument("--robot", default="", metavar="NAME", help="lines about this robot only")
-    logs.add_argument("--tenant", default="", metavar="NAME", help="lines about this tenant only")
-    logs.add_argument(
-        "--level", choices=("debug", "info", "warning", "error"), default="debug",
-        help="lines of at least this level (default: all)",
-    )  # fmt: skip
-    parser.add_argument("--no-page", action="store_true", help="start no fleet page")
-    parser.add_argument(
-        "--burst", nargs="?", type=int, const=0, metavar="P",
-        help="also run the burst function, at port P on loopback (default "
-        f"{_BURST_PORT}): robots ask it while no server answers in time",
-    )  # fmt: skip
-    parser.add_argument(
-        "--rosbridge", action="store_true",
+    no_page: bool = option("--no-page", help="do not start the fleet page")
+    burst: int | None = option(
+        "--burst",
+        nargs="?",
+        const=0,
+        metavar="P",
+        help=f"also run the burst function, at port P on loopback (default {_BURST_PORT}): robots call it "
+        "while no server answers in time",
+    )
+    rosbridge: bool = option(
+        "--rosbridge",
         help="also serve rosbridge v2 clients, on the path /rosbridge (serving.rosbridge)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
-    parser.add_argument(
-        "--record", type=Path, metavar="DIR",
-        help="record what robots and servers say in DIR, for rse-pf replay (recording.folder)",
-    )  # fmt: skip
-    parser.add_argument(
+    no_data: bool = option(
+        "--no-data", help="do not start the data service (large data by HTTP under /data/)"
+    )
+    record: Path | None = option(
+        "--record",
+        metavar="DIR",
+        help="record the messages of robots and servers in DIR, for rse-pf replay (recording.folder)",
+    )
+    services: str | None = option(
         "--services", metavar="DIR", help="also run the services installed there (rse-pf service install)"
     )
-    parser.add_argument(
-        "--accept-weak-isolation",
-        action="store_true",
-        help="run them even if the kernel lacks a kind of isolation",
+    accept_weak_isolation: bool = option(
+        "--accept-weak-isolation", help="run services even if the kernel lacks a kind of isolation"
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Start or stop a platform, show its state, or inject a fault."""
-    from rse_pf.local.state import state_folder
+@dataclass(frozen=True, kw_only=True)
+class _StatusRequest(PlatformRequest):
+    json: bool = option("--json", help="print JSON")
 
-    _check(args)
-    folder = state_folder(args.name, os.environ)
-    if args.action == "stop":
-        from rse_pf.local.state import stop_platform
 
-        stopped = stop_platform(folder)
-        show(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
-        return 0
-    if args.action in _OF_LOGS:
-        return _logs(args, folder)
-    if args.action != "start":
-        return _on_running(args, folder)
+@dataclass(frozen=True, kw_only=True)
+class _LogsRequest(PlatformRequest):
+    json: bool = option("--json", help="print one JSON object for each line")
+    process: str | None = option(
+        "--server", metavar="ID", help="show only lines of this process, or about it"
+    )
+    follow: bool = option("--follow", help="continue with new lines until Ctrl-C")
+    since: str | None = option(
+        "--since",
+        metavar="TIME",
+        help='all lines of the last 90s, 5m, 2h or 1d, or since "2026-03-01 14:30"',
+    )
+    robot: str = option("--robot", default="", metavar="NAME", help="show only lines about this robot")
+    tenant: str = option("--tenant", default="", metavar="NAME", help="show only lines about this tenant")
+    level: str = option(
+        "--level",
+        choices=("debug", "info", "warning", "error"),
+        default="debug",
+        help="show only lines of at least this level (default: all)",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ServerRequest(PlatformRequest):
+    server: str = option(metavar="SERVER", help="a server, as rse-pf local status lists it")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RollRequest(PlatformRequest):
+    settings: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FaultRequest(_ServerRequest):
+    for_s: float | None = option(
+        "--for", metavar="S", help="end the fault after S seconds (default: with Ctrl-C)"
+    )
+
+    def waiter(self) -> Callable[[float], bool]:
+        """Return the function that waits for the end of the fault; raises UsageError for a wrong time."""
+        if self.for_s is not None and not self.for_s > 0:
+            raise UsageError("--for takes a positive number of seconds", hint="leave it out")
+        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
+        end_s = math.inf if self.for_s is None else time.monotonic() + self.for_s
+        return functools.partial(_wait, end_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SlowRequest(_FaultRequest):
+    percent: float = option(
+        "--percent", required=True, metavar="P", help="leave the server P %% of its CPU time"
+    )
+
+
+def start(request: _StartRequest, settings: PlatformSettings) -> int:
+    """Run a platform until a signal or rse-pf local stop."""
+    folder = request.folder
     require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
     from rse_pf.extensions.recording.writer import with_recordings
 
-    overrides = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
+    overrides = {"servers": request.servers, "port": request.port, "metrics_port": request.metrics_port}
     chosen = settings.replace(local={name: value for name, value in overrides.items() if value is not None})
-    chosen = with_recordings(_with_services(chosen, args), args.record)
-    if args.rosbridge:
+    chosen = with_recordings(
+        _with_services(chosen, request.services, request.accept_weak_isolation), request.record
+    )
+    if request.rosbridge:
         chosen = chosen.replace(serving={"rosbridge": True})
-    lan = chosen_address(args.lan)
-    page = not args.no_page
-    burst_port = None if args.burst is None else args.burst or _BURST_PORT
+    lan = chosen_address(request.lan)
+    burst_port = None if request.burst is None else request.burst or _BURST_PORT
     if burst_port is not None:
         chosen = _with_burst(chosen, burst_port, lan)
     return asyncio.run(
         _foreground(
-            args.name, folder, chosen, data=not args.no_data, lan=lan,
-            extras=_Extras(page=page, burst_port=burst_port),
+            request.name, folder, chosen, data=not request.no_data, lan=lan,
+            extras=_Extras(page=not request.no_page, burst_port=burst_port),
         )
     )  # fmt: skip
 
 
+def stop(request: PlatformRequest, settings: PlatformSettings) -> None:
+    """Stop a platform that runs."""
+    from rse_pf.local.state import stop_platform
+
+    stopped = stop_platform(request.folder)
+    show(f"platform {request.name!r} {'is stopped' if stopped else 'was not running'}")
+
+
 def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSettings:
-    """Return *settings* whose servers tell robots of the burst function at *port*."""
+    """Return *settings* whose servers announce the burst function to robots, at *port*."""
     from rse_pf.config.front_door import BURST_PATH
     from rse_pf.local.firewall import check_listener
 
@@ -188,95 +262,94 @@ def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSett
     return settings.replace(burst={"url": f"http://127.0.0.1:{port}{BURST_PATH}"})
 
 
-def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
+def _with_services(
+    settings: PlatformSettings, services: str | None, is_weak_accepted: bool
+) -> PlatformSettings:
     """Return *settings* with the options for installed services; raises UsageError for a damaged service."""
-    changes: dict[str, Any] = {"accept_weak_isolation": True} if args.accept_weak_isolation else {}
-    if args.services is not None:
+    changes: dict[str, Any] = {"accept_weak_isolation": True} if is_weak_accepted else {}
+    if services is not None:
         from rse_pf.services.custom.installed import installed_services
 
-        folder = Path(args.services).absolute()
+        folder = Path(services).absolute()
         installed_services(folder)
         changes["folder"] = str(folder)
     return settings.replace(services=changes)
 
 
-def _check(args: argparse.Namespace) -> None:
-    """Raise UsageError for options that the action does not take."""
-    if args.action in _OF_A_SERVER and args.server is None:
-        raise UsageError(
-            f"rse-pf local {args.action} needs a server", hint="rse-pf local status shows their names"
-        )
-    if args.action not in _OF_A_SERVER and args.server is not None:
-        hint = "name it with --server" if args.action in _OF_LOGS else "leave the name out"
-        raise UsageError(f"rse-pf local {args.action} takes no server", hint=hint)
-    if args.action != "start" and args.burst is not None:
-        raise UsageError("--burst is for the start of a platform", hint="see rse-pf local --help")
-    of_logs = (args.of_server, args.follow, args.since, args.robot, args.tenant)
-    if args.action not in _OF_LOGS and any(of_logs):
-        raise UsageError(
-            "--server, --follow, --since, --robot and --tenant are for logs and events",
-            hint="see rse-pf local --help",
-        )
-    of_start = (args.lan, args.metrics_port, args.record, args.rosbridge or None)
-    if args.action != "start" and any(value is not None for value in of_start):
-        raise UsageError(
-            "--lan, --metrics-port, --record and --rosbridge are for the start of a platform",
-            hint="see rse-pf local --help",
-        )
-    if args.for_s is not None and (args.action not in ("pause", "slow", "partition") or not args.for_s > 0):
-        raise UsageError(
-            "--for takes a positive number of seconds, for pause, slow and partition", hint="leave it out"
-        )
-    if (args.percent is not None) != (args.action == "slow"):
-        raise UsageError("--percent belongs to slow, and slow needs it", hint="for example: --percent 10")
-
-
-def _on_running(args: argparse.Namespace, folder: Any) -> int:
+def show_status(request: _StatusRequest, settings: PlatformSettings) -> None:
+    """Show servers, alarms and load of a platform."""
     from rse_pf.local.control.status import platform_status, status_table
-    from rse_pf.local.faults import faults
-    from rse_pf.local.state import read_state
 
-    state = read_state(folder)
-    if state is None:
-        raise UsageError(f"platform {args.name!r} is not running", hint="start it with: rse-pf local")
-    if args.action == "status":
-        status = asyncio.run(platform_status(state, sample_s=_SAMPLE_S))
-        if args.json:
-            show_json(status, indent=2)
-        else:
-            show_page(status_table(status))
-        return 0
-    if args.action == "robots":
-        return _robots(args, state)
-    if args.action in ("drain", "roll"):
-        return _operate(args, state)
-    if args.action == "kill-balancer":
-        show(f"killed the load balancer (pid {faults.kill_balancer(state)})")
-        return 0
-    server = faults.find_server(state, args.server)
-    if args.action == "pause" and args.for_s is not None:
-        _check_pause(args.for_s, faults.longest_pause_s(state, server, _health(folder)), server.name)
-    signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
-    wait = functools.partial(_wait, math.inf if args.for_s is None else time.monotonic() + args.for_s)
-    if args.action == "slow":
-        show(f"{server.name} has {args.percent:g} % of its time; Ctrl-C ends that")
-        faults.slow_down(server.process, args.percent, wait)
-        show(f"{server.name} {_describe_outcome(server, 'has all of its time again')}")
-    elif args.action == "partition":
-        with faults.cut_off(server, args.name):
-            show(f"{server.name} is cut off; Ctrl-C ends that")
-            wait(math.inf)
-        show(f"{server.name} {_describe_outcome(server, 'is reachable again')}")
+    status = asyncio.run(platform_status(request.read_state(), sample_s=_SAMPLE_S))
+    if request.json:
+        show_json(status, indent=2)
     else:
-        number = {"kill": signal.SIGKILL, "pause": signal.SIGSTOP, "resume": signal.SIGCONT}[args.action]
-        count = faults.signal_tree(server.process, number)
-        done = {"kill": "killed", "pause": "stopped", "resume": "let go on"}[args.action]
-        show(f"{done}: {server.name} (pid {server.process.pid}, {count} processes)")
-        if args.action == "pause" and args.for_s is not None:
-            wait(math.inf)
-            faults.signal_tree(server.process, signal.SIGCONT)
-            show(f"{server.name} {_describe_outcome(server, 'goes on')}")
-    return 0
+        show_page(status_table(status))
+
+
+def kill_balancer(request: PlatformRequest, settings: PlatformSettings) -> None:
+    """Kill the load balancer; the control plane starts another one."""
+    from rse_pf.local.faults import faults
+
+    show(f"killed the load balancer (pid {faults.kill_balancer(request.read_state())})")
+
+
+def kill(request: _ServerRequest, settings: PlatformSettings) -> None:
+    """Kill all processes of a server."""
+    _signal(request, signal.SIGKILL, "killed")
+
+
+def resume(request: _ServerRequest, settings: PlatformSettings) -> None:
+    """Continue a server that was paused."""
+    _signal(request, signal.SIGCONT, "continued")
+
+
+def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
+    """Stop all processes of a server, and continue them after a time if one is named."""
+    from rse_pf.local.faults import faults
+
+    state = request.read_state()
+    server = faults.find_server(state, request.server)
+    if request.for_s is not None:
+        longest_s = faults.longest_pause_s(state, server, _health(request.folder))
+        _check_pause(request.for_s, longest_s, server.name)
+    wait = request.waiter()
+    _signal(request, signal.SIGSTOP, "stopped")
+    if request.for_s is not None:
+        wait(math.inf)
+        faults.signal_tree(server.process, signal.SIGCONT)
+        show(f"{server.name} {_describe_outcome(server, 'continues')}")
+
+
+def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
+    """Leave a server a part of its CPU time, until a time is over or Ctrl-C."""
+    from rse_pf.local.faults import faults
+
+    server = faults.find_server(request.read_state(), request.server)
+    wait = request.waiter()
+    show(f"{server.name} has {request.percent:g} % of its time; Ctrl-C ends that")
+    faults.slow_down(server.process, request.percent, wait)
+    show(f"{server.name} {_describe_outcome(server, 'has all of its time again')}")
+
+
+def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
+    """Cut a server off from the network, until a time is over or Ctrl-C."""
+    from rse_pf.local.faults import faults
+
+    server = faults.find_server(request.read_state(), request.server)
+    wait = request.waiter()
+    with faults.cut_off(server, request.name):
+        show(f"{server.name} is cut off; Ctrl-C ends that")
+        wait(math.inf)
+    show(f"{server.name} {_describe_outcome(server, 'is reachable again')}")
+
+
+def _signal(request: _ServerRequest, number: signal.Signals, done: str) -> None:
+    from rse_pf.local.faults import faults
+
+    server = faults.find_server(request.read_state(), request.server)
+    count = faults.signal_tree(server.process, number)
+    show(f"{done}: {server.name} (pid {server.process.pid}, {count} processes)")
 
 
 def _health(folder: Path) -> HealthSettings:
@@ -302,41 +375,48 @@ def _describe_outcome(server: Any, done: str) -> str:
     return done if is_alive(server.process) else "is gone: it was replaced meanwhile"
 
 
-def _logs(args: argparse.Namespace, folder: Path) -> int:
-    from rse_pf.cli.local_platform import logs
+def show_logs(request: _LogsRequest, settings: PlatformSettings) -> None:
+    """Show the newest lines of the logs of all processes, and new ones with --follow."""
+    _show_lines(request, format_line, line_document)
 
-    is_events = args.action == "events"
-    wanted = logs.LogFilter(
-        level=args.level,
-        since_s=-math.inf if args.since is None else logs.since_time_s(args.since, time.time()),
-        robot=args.robot,
-        tenant=args.tenant,
-        process=args.of_server or "",
-        events_only=is_events,
+
+def show_events(request: _LogsRequest, settings: PlatformSettings) -> None:
+    """Show what happened to servers, robots and live maps."""
+    _show_lines(request, format_event, event_document)
+
+
+def _show_lines(
+    request: _LogsRequest, to_text: Callable[[LogLine], str], to_document: Callable[[LogLine], Any]
+) -> None:
+    wanted = LogFilter(
+        level=request.level,
+        since_s=-math.inf if request.since is None else since_time_s(request.since, time.time()),
+        robot=request.robot,
+        tenant=request.tenant,
+        process=request.process or "",
+        events_only=to_text is format_event,
     )
-    to_text = logs.format_event if is_events else logs.format_line
-    to_document = logs.event_document if is_events else logs.line_document
 
-    def show_line(line: logs.LogLine) -> None:
-        if args.json:
+    def show_line(line: LogLine) -> None:
+        if request.json:
             show_json(to_document(line))
         else:
             show(to_text(line))
 
-    follower = logs.LogFollower(folder, wanted)
-    for line in logs.last_lines(logs.log_files(folder, args.of_server), wanted, _LINES):
+    follower = LogFollower(request.folder, wanted)
+    for line in last_lines(log_files(request.folder, request.process), wanted, _LINES):
         show_line(line)
-    if args.follow:
+    if request.follow:
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
         follower.follow(show_line, functools.partial(_wait, math.inf, _FOLLOW_S))
-    return 0
 
 
-def _robots(args: argparse.Namespace, state: Any) -> int:
+def show_robots(request: _StatusRequest, settings: PlatformSettings) -> int:
+    """Show the robots that are connected; return 1 if a server did not answer."""
     from rse_pf.cli.local_platform.robots import connected_robots, robots_table
 
-    robots = connected_robots(state)
-    if args.json:
+    robots = connected_robots(request.read_state())
+    if request.json:
         show_json(robots, indent=2)
     else:
         show(*robots_table(robots))
@@ -345,19 +425,28 @@ def _robots(args: argparse.Namespace, state: Any) -> int:
     return 1 if robots["silent"] else 0
 
 
-def _operate(args: argparse.Namespace, state: Any) -> int:
-    """Drain a server or replace all; Ctrl-C ends only the report."""
+def drain(request: _ServerRequest, settings: PlatformSettings) -> int:
+    """Move the robots of a server to other servers, and close it."""
+    return _operate(request, "drain", {"server": request.server}, f"{request.server} has left")
+
+
+def roll(request: _RollRequest, settings: PlatformSettings) -> int:
+    """Replace all servers without loss, by those of other settings if a file is named."""
+    file = request.settings
+    parameters = {} if file is None else {"settings": str(file.absolute())}
+    return _operate(request, "roll", parameters, "every server was replaced")
+
+
+def _operate(request: PlatformRequest, action: str, parameters: dict[str, str], done: str) -> int:
+    """Let the control plane operate, and show its events; Ctrl-C ends only the report."""
     from rse_pf.cli.local_platform.operations import operate
 
-    parameters = {} if args.server is None else {"server": args.server}
-    if args.action == "roll" and args.settings is not None:
-        parameters = {"settings": str(args.settings.absolute())}
     try:
-        operate(state, args.action, _show, **parameters)
+        operate(request.read_state(), action, _show, **parameters)
     except KeyboardInterrupt:
-        show("the platform goes on with it; rse-pf local status shows how far it is", error=True)
+        show("the platform continues; rse-pf local status shows its progress", error=True)
         return 130
-    show(f"{args.server} has left" if args.action == "drain" else "every server was replaced")
+    show(done)
     return 0
 
 
@@ -470,7 +559,6 @@ def _lan_lines(platform: Any, which: str) -> list[str]:
 
 
 def _show(event: Any) -> None:
-    from rse_pf.cli.local_platform.logs import local_time
     from rse_pf.extensions.fleet_page.feeds.events import EVENTS, event_sentence
 
     if event["event"] in EVENTS and event["event"] not in _QUIET:
@@ -484,3 +572,90 @@ _QUIET = frozenset(
     )
 )  # fmt: skip
 """Events that the terminal does not show: another event of the same server follows at once."""
+
+ACTION = Action(
+    default="start",
+    actions={
+        "start": Action(
+            help="run a platform until Ctrl-C (default)",
+            example="rse-pf local --servers 2",
+            request=_StartRequest,
+            run=start,
+        ),
+        "stop": Action(
+            help="stop a platform", example="rse-pf local stop", request=PlatformRequest, run=stop
+        ),
+        "status": Action(
+            help="show servers, alarms and load",
+            example="rse-pf local status",
+            request=_StatusRequest,
+            run=show_status,
+        ),
+        "robots": Action(
+            help="show the robots that are connected",
+            example="rse-pf local robots",
+            request=_StatusRequest,
+            run=show_robots,
+        ),
+        "logs": Action(
+            help="show the logs of all processes",
+            example="rse-pf local logs --since 5m --level warning",
+            request=_LogsRequest,
+            run=show_logs,
+        ),
+        "events": Action(
+            help="show what happened to servers, robots and live maps",
+            example="rse-pf local events --follow --json",
+            request=_LogsRequest,
+            run=show_events,
+        ),
+        "drain": Action(
+            help="move the robots of a server to other servers, and close it",
+            example="rse-pf local drain server-1",
+            request=_ServerRequest,
+            run=drain,
+        ),
+        "roll": Action(
+            help="replace all servers without loss",
+            example="rse-pf local roll --settings settings.json",
+            request=_RollRequest,
+            run=roll,
+        ),
+        "kill": Action(
+            help="inject a fault: kill all processes of a server",
+            example="rse-pf local kill server-1",
+            request=_ServerRequest,
+            run=kill,
+        ),
+        "pause": Action(
+            help="inject a fault: stop all processes of a server",
+            example="rse-pf local pause server-1 --for 0.3",
+            request=_FaultRequest,
+            run=pause,
+        ),
+        "resume": Action(
+            help="continue a server that was paused",
+            example="rse-pf local resume server-1",
+            request=_ServerRequest,
+            run=resume,
+        ),
+        "slow": Action(
+            help="inject a fault: leave a server a part of its CPU time",
+            example="rse-pf local slow server-2 --percent 10 --for 30",
+            request=_SlowRequest,
+            run=slow,
+        ),
+        "partition": Action(
+            help="inject a fault: cut a server off from the network",
+            example="rse-pf local partition server-1 --for 5",
+            request=_FaultRequest,
+            run=partition,
+        ),
+        "kill-balancer": Action(
+            help="inject a fault: kill the load balancer",
+            example="rse-pf local kill-balancer",
+            request=PlatformRequest,
+            run=kill_balancer,
+        ),
+    },
+)

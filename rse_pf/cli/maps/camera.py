@@ -15,10 +15,10 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ import numpy as np
 
 from rse_pf.cli.maps.frame_table import named_frames
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_progress
@@ -35,92 +36,105 @@ if TYPE_CHECKING:
 
     from client_sdk.cameras.board import Board
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 _WANTED_VIEWS = 25
 _LIVE_IMAGES = 3000
 """A live calibration ends after so many images even if there are too few views."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    board = argparse.ArgumentParser(add_help=False)
-    board.add_argument("--board", metavar="CxR", help="inner corners of the board (default: 9x6)")
-    board.add_argument("--square-mm", type=float, metavar="MM", help="edge of a square (default: 25)")
-    calibrate = actions.add_parser(
-        "calibrate",
-        parents=[board],
-        help="write the intrinsics of a camera, by a board or, without --board and --square-mm, by motion",
-        description="Without --board, --square-mm and --stereo, the motion in SOURCE calibrates the camera.",
-    )
-    calibrate.add_argument(
-        "sources",
+@dataclass(frozen=True, kw_only=True)
+class _BoardRequest:
+    board: str | None = option("--board", metavar="CxR", help="inner corners of the board (default: 9x6)")
+    square_mm: float | None = option("--square-mm", metavar="MM", help="edge of a square (default: 25)")
+
+    def read_board(self) -> Board:
+        """Return the board; raises UsageError."""
+        from client_sdk.cameras.board import Board
+
+        return Board.parse(self.board or "9x6", 25.0 if self.square_mm is None else self.square_mm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _WriteRequest(_BoardRequest):
+    out: Path = option("--out", default=Path("board.pdf"), metavar="FILE", help="a .pdf file")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CalibrateRequest(_BoardRequest):
+    sources: tuple[str, ...] = option(
         nargs="+",
         metavar="SOURCE",
         help="a device number, a video, images or a recording; with --stereo two of them, which see a board",
     )
-    calibrate.add_argument(
-        "--stereo", action="store_true",
+    stereo: bool = option(
+        "--stereo",
         help="two devices, videos or folders, or one whose images show both cameras side by side",
-    )  # fmt: skip
-    calibrate.add_argument(
-        "--out", type=Path, metavar="FILE", help="default: intrinsics.json; with --stereo: rig.json"
     )
-    calibrate.add_argument(
-        "--max-rms-px", type=float, default=1.0, metavar="PX", help="refuse a larger error (default: 1)"
+    out: Path | None = option(
+        "--out", metavar="FILE", help="default: intrinsics.json; with --stereo: rig.json"
     )
-    calibrate.add_argument(
-        "--depth-scale", type=float, metavar="N",
+    max_rms_px: float = option(
+        "--max-rms-px",
+        default=1.0,
+        metavar="PX",
+        help="refuse a calibration with a larger reprojection error (default: 1)",
+    )
+    depth_scale: float | None = option(
+        "--depth-scale",
+        metavar="N",
         help="units of a 16-bit depth image in a metre (default: left out, which means 1000)",
-    )  # fmt: skip
-    write = actions.add_parser("board", parents=[board], help="write a board to print")
-    write.add_argument("--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="a .pdf file")
-    check = actions.add_parser("check", help="say what a camera gives: size, rate, depth, blur")
-    check.add_argument("source", metavar="SOURCE", help="a device, a video, a folder or a recording")
-    check.add_argument("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")
-    check.add_argument("--json", action="store_true", help="print JSON")
+    )
+
+    @property
+    def file(self) -> Path:
+        """The file that is written."""
+        return self.out or Path("rig.json" if self.stereo else "intrinsics.json")
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Do one action and return the exit code."""
-    if args.action == "check":
-        return _check(args)
-    from client_sdk.cameras.board import Board, write_board
+@dataclass(frozen=True, kw_only=True)
+class _CheckRequest:
+    source: str = option(metavar="SOURCE", help="a device, a video, a folder or a recording")
+    frames: int = option("--frames", default=60, metavar="N", help="frames to look at (default: 60)")
+    json: bool = option("--json", help="print JSON")
 
-    has_board = args.board is not None or args.square_mm is not None
-    square_mm = 25.0 if args.square_mm is None else args.square_mm
-    board = Board.parse(args.board or "9x6", square_mm)
-    if args.action == "calibrate":
-        return _calibrate(args, board if has_board or args.stereo else None)
-    write_board(args.out, board)
+
+def write_board_file(request: _WriteRequest, settings: PlatformSettings) -> None:
+    """Write a board that can be printed."""
+    from client_sdk.cameras.board import write_board
+
+    board = request.read_board()
+    write_board(request.out, board)
+    square_mm = 25.0 if request.square_mm is None else request.square_mm
     show(
-        f"{args.out}: {board.columns}x{board.rows} inner corners, squares of {square_mm:g} mm",
+        f"{request.out}: {board.columns}x{board.rows} inner corners, squares of {square_mm:g} mm",
         "print it at 100 %, measure a square, and fix it to something flat",
     )
-    return 0
 
 
-def _calibrate(args: argparse.Namespace, board: Board | None) -> int:
-    """Calibrate by views of *board*, or by the motion of the camera without a board."""
-    if args.out is None:
-        args.out = Path("rig.json" if args.stereo else "intrinsics.json")
-    if not args.max_rms_px > 0:
-        raise UsageError(f"--max-rms-px {args.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
-    if not args.out.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
+def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> None:
+    """Calibrate by views of a board, or by the motion of the camera without a board."""
+    has_board = request.board is not None or request.square_mm is not None or request.stereo
+    board = request.read_board() if has_board else None
+    if not request.max_rms_px > 0:
+        raise UsageError(f"--max-rms-px {request.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
+    if not request.file.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {request.file.absolute().parent}", hint="create it")
     if board is None:
-        return _calibrate_from_motion(args)
-    return _calibrate_stereo(args, board) if args.stereo else _calibrate_with_board(args, board)
+        _calibrate_from_motion(request)
+    elif request.stereo:
+        _calibrate_stereo(request, board)
+    else:
+        _calibrate_with_board(request, board)
 
 
-def _calibrate_with_board(args: argparse.Namespace, board: Board) -> int:
+def _calibrate_with_board(request: _CalibrateRequest, board: Board) -> None:
     from client_sdk.cameras.calibration import BoardViews, calibrate
     from client_sdk.rigs.intrinsics import write_intrinsics
 
     views = BoardViews(board)
-    is_live = len(args.sources) == 1 and args.sources[0].isdigit()
-    for image in _raw_images(args.sources):
+    is_live = len(request.sources) == 1 and request.sources[0].isdigit()
+    for image in _raw_images(request.sources):
         views.add(image)
         show_progress(
             f"{len(views.views)} of {_WANTED_VIEWS} views in {views.images} images; move and tilt the board",
@@ -129,18 +143,17 @@ def _calibrate_with_board(args: argparse.Namespace, board: Board) -> int:
         if len(views.views) >= _WANTED_VIEWS or (is_live and views.images >= _LIVE_IMAGES):
             break
     show_progress(f"{len(views.views)} views in {views.images} images; computing", is_over=True)
-    calibration = calibrate(views, max_rms_px=args.max_rms_px, depth_scale=args.depth_scale)
-    write_intrinsics(args.out, calibration)
+    calibration = calibrate(views, max_rms_px=request.max_rms_px, depth_scale=request.depth_scale)
+    write_intrinsics(request.file, calibration)
     camera = calibration.camera
     show(
-        f"{args.out}: fx {camera.fx:.2f}  fy {camera.fy:.2f}  cx {camera.cx:.2f}  cy {camera.cy:.2f}, "
+        f"{request.file}: fx {camera.fx:.2f}  fy {camera.fy:.2f}  cx {camera.cx:.2f}  cy {camera.cy:.2f}, "
         f"{camera.width}x{camera.height} px",
         f"reprojection error {calibration.rms_px:.3f} px rms over {calibration.views} views",
     )
-    return 0
 
 
-def _calibrate_from_motion(args: argparse.Namespace) -> int:
+def _calibrate_from_motion(request: _CalibrateRequest) -> None:
     from client_sdk.cameras.self_calibration import calibrate_from_motion
     from client_sdk.cameras.view_selection import select_views
     from client_sdk.rigs.intrinsics import intrinsics_to_json, write_json
@@ -150,37 +163,36 @@ def _calibrate_from_motion(args: argparse.Namespace) -> int:
     def on_progress(step: str) -> None:
         show_progress(f"{len(views)} views of {images} images: {step}", is_over=False)
 
-    views, images = select_views(itertools.islice(_raw_images(args.sources), _LIVE_IMAGES))
+    views, images = select_views(itertools.islice(_raw_images(request.sources), _LIVE_IMAGES))
     found = calibrate_from_motion(
         views,
-        max_rms_px=args.max_rms_px,
-        depth_scale=args.depth_scale,
+        max_rms_px=request.max_rms_px,
+        depth_scale=request.depth_scale,
         on_progress=on_progress,
     )
     deviations = found.standard_deviations
     stated = {name: float(f"{value:.3g}") for name, value in deviations.items()}
-    write_json(args.out, intrinsics_to_json(found.intrinsics) | {"standard_deviations": stated})
+    write_json(request.file, intrinsics_to_json(found.intrinsics) | {"standard_deviations": stated})
     camera, distortion = found.intrinsics.camera, found.intrinsics.distortion
     centre = "in the middle of the image, not estimated"
     if "cx" in deviations:
         centre = f"+- {deviations['cx']:.1f} and {deviations['cy']:.1f}"
     show(
-        f"{args.out}: fx = fy = {camera.fx:.1f} +- {deviations['f']:.1f} px, "
+        f"{request.file}: fx = fy = {camera.fx:.1f} +- {deviations['f']:.1f} px, "
         f"cx {camera.cx:.1f}, cy {camera.cy:.1f} ({centre}), {camera.width}x{camera.height} px",
         f"k1 {distortion[0]:.4f} +- {deviations['k1']:.4f}, k2 {distortion[1]:.4f} +- {deviations['k2']:.4f}",
         f"reprojection error {found.intrinsics.rms_px:.3f} px rms over {found.intrinsics.views} views "
         f"of {images} images",
     )
-    return 0
 
 
-def _calibrate_stereo(args: argparse.Namespace, board: Board) -> int:
+def _calibrate_stereo(request: _CalibrateRequest, board: Board) -> None:
     from client_sdk.cameras.stereo_calibration import PairViews, calibrate_pair
     from client_sdk.rigs.rig_file import write_rig
 
     views = PairViews(board)
-    is_live = all(source.isdigit() for source in args.sources)
-    for left, right in _raw_pairs(args.sources):
+    is_live = all(source.isdigit() for source in request.sources)
+    for left, right in _raw_pairs(request.sources):
         views.add(left, right)
         show_progress(
             f"{len(views.pairs)} of {_WANTED_VIEWS} views of both in {views.left.images} pairs; "
@@ -190,21 +202,20 @@ def _calibrate_stereo(args: argparse.Namespace, board: Board) -> int:
         if len(views.pairs) >= _WANTED_VIEWS or (is_live and views.left.images >= _LIVE_IMAGES):
             break
     show_progress(f"{len(views.pairs)} views of both; computing", is_over=True)
-    found = calibrate_pair(views, max_rms_px=args.max_rms_px)
-    write_rig(args.out, found.rig)
+    found = calibrate_pair(views, max_rms_px=request.max_rms_px)
+    write_rig(request.file, found.rig)
     show(
-        f"{args.out}: baseline {1e3 * found.baseline_m:.2f} mm; reprojection error {found.rms_px:.3f} px rms "
-        f"over {found.views} views of both cameras",
+        f"{request.file}: baseline {1e3 * found.baseline_m:.2f} mm; "
+        f"reprojection error {found.rms_px:.3f} px rms over {found.views} views of both cameras",
         *(
             f"{each.name}: fx {each.lens.camera.fx:.2f}  fy {each.lens.camera.fy:.2f}, "
             f"{each.lens.rms_px:.3f} px rms over {each.lens.views} views"
             for each in found.rig.cameras
         ),
     )
-    return 0
 
 
-def _raw_pairs(sources: list[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]]:
+def _raw_pairs(sources: Sequence[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]]:
     """Yield grey images of both cameras."""
     if len(sources) > 2:
         raise UsageError(
@@ -221,7 +232,7 @@ def _raw_pairs(sources: list[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.
         yield np.ascontiguousarray(image[:, :half]), np.ascontiguousarray(image[:, half : 2 * half])
 
 
-def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
+def _raw_images(sources: Sequence[str]) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield grey images as the lens gives them; of a recording those of its first or left camera."""
     from client_sdk.cameras.folder import list_folder
     from client_sdk.cameras.opencv_video import open_video
@@ -246,34 +257,34 @@ def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
         video.close()
 
 
-def _check(args: argparse.Namespace) -> int:
-    """Look at some frames and say what they are; the exit code is 1 if most are blurred."""
-    if args.frames < 2:
-        raise UsageError(f"--frames {args.frames} is below 2", hint="60 is two seconds of a webcam")
+def check_camera(request: _CheckRequest, settings: PlatformSettings) -> int:
+    """Show what the frames of a camera are like; the exit code is 1 if most are blurred."""
+    if request.frames < 2:
+        raise UsageError(f"--frames {request.frames} is below 2", hint="60 is two seconds of a webcam")
     from client_sdk.check.images import FrameStatistics
 
     stamps, statistics, size = [], FrameStatistics(), (0, 0)
     lengths: Counter[str] = Counter()
-    for stamp, rgb, length in itertools.islice(_frames(args.source), args.frames):
+    for stamp, rgb, length in itertools.islice(_frames(request.source), request.frames):
         stamps.append(stamp)
         statistics.add(stamp, rgb)
         lengths[length] += 1
         size = (rgb.shape[1], rgb.shape[0])
     if len(stamps) < 2:
-        raise UsageError(f"{args.source} gives {len(stamps)} frames", hint="a check needs 2 or more")
+        raise UsageError(f"{request.source} gives {len(stamps)} frames", hint="a check needs 2 or more")
     unsharp = [int(row) + 1 for row in np.flatnonzero(statistics.blurred() | statistics.empty())]
     rate_hz = (len(stamps) - 1) / max(stamps[-1] - stamps[0], 1e-9)
     figures: dict[str, Any] = {
-        "source": args.source, "width": size[0], "height": size[1], "frames": len(stamps),
+        "source": request.source, "width": size[0], "height": size[1], "frames": len(stamps),
         "rate_hz": round(rate_hz, 2), "with_depth": lengths["depth"],
         "with_stereo": lengths["a stereo pair"], "blurred": len(unsharp),
     }  # fmt: skip
-    if args.json:
+    if request.json:
         show_json(figures)
     else:
         length = next(filter(None, lengths), "no depth")
         show(
-            f"{args.source}: {size[0]}x{size[1]} px, {rate_hz:.1f} frames per second, {length}",
+            f"{request.source}: {size[0]}x{size[1]} px, {rate_hz:.1f} frames per second, {length}",
             f"{len(unsharp)} of the first {len(stamps)} frames are blurred or empty"
             + (f": {named_frames(unsharp)}" if unsharp else ""),
         )
@@ -313,3 +324,28 @@ def _gray(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Return the luminance, ITU-R BT.601, as OpenCV does."""
     gray: npt.NDArray[np.uint8] = np.rint(rgb @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
     return gray
+
+
+ACTION = Action(
+    actions={
+        "calibrate": Action(
+            help="write the intrinsics of a camera, from views of a board or from motion",
+            description="Without --board, --square-mm and --stereo, the motion of the camera is used.",
+            example="rse-pf camera calibrate 0 --board 9x6 --square-mm 25",
+            request=_CalibrateRequest,
+            run=calibrate_camera,
+        ),
+        "board": Action(
+            help="write a board to print",
+            example="rse-pf camera board --board 9x6 --square-mm 25 --out board.pdf",
+            request=_WriteRequest,
+            run=write_board_file,
+        ),
+        "check": Action(
+            help="show what a camera gives: size, rate, depth, blur",
+            example="rse-pf camera check 0",
+            request=_CheckRequest,
+            run=check_camera,
+        ),
+    }
+)

@@ -9,59 +9,71 @@ example:
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rse_pf.aws.storage import open_data_store
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show_page
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
-# Options that are settings of the same name.
-_OPTIONS: dict[str, type] = {"host": str, "port": int, "store": str}
+_ROWS = {row.name: row for row in setting_rows() if row.group == "data"}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    rows = {row.name: row for row in setting_rows() if row.group == "data"}
-    for name, kind in _OPTIONS.items():
-        parser.add_argument(
-            f"--{name}", type=kind, help=f"{rows[name].doc} (data.{name}, default {rows[name].default})"
-        )
-    parser.add_argument(
-        "--keys", type=Path, metavar="FILE",
-        help="public keys of the tokens, a JWKS; roster and deny list are in control/ beside it",
-    )  # fmt: skip
-    parser.add_argument(
-        "--audit",
-        type=Path,
-        metavar="DIR",
-        help="folder of the audit log of map changes and refused tokens",
+def _setting(name: str) -> Any:
+    """Return the option of a setting of the group data."""
+    row = _ROWS[name]
+    return option(f"--{name}", help=f"{row.doc} (data.{name}, default {row.default})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataRequest:
+    """Where the data service listens, what it stores, and whom it trusts."""
+
+    host: str | None = _setting("host")
+    port: int | None = _setting("port")
+    store: str | None = _setting("store")
+    keys: Path | None = option(
+        "--keys",
+        metavar="FILE",
+        help="public keys of the tokens, a JWKS; the folder control/ next to it holds roster and deny list",
     )
-    parser.add_argument("--openapi", action="store_true", help="print the OpenAPI document and exit")
-    parser.add_argument(
-        "--announce", type=Path, metavar="FILE", help="file that gets pid and port when the service is ready"
+    audit: Path | None = option(
+        "--audit", metavar="DIR", help="folder of the audit log of map changes and refused tokens"
+    )
+    openapi: bool = option("--openapi", help="print the OpenAPI document and exit")
+    announce: Path | None = option(
+        "--announce", metavar="FILE", help="write pid and port to FILE when the service is ready"
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def run_data(request: DataRequest, settings: PlatformSettings) -> int:
     """Serve until a signal ends the process."""
-    if args.openapi:
+    if request.openapi:
         from rse_pf.data_server.routes import openapi_page
 
         show_page(openapi_page())
         return 0
-    if args.keys is None:
+    if request.keys is None:
         raise UsageError("--keys is missing", hint="give a JWKS; rse-pf local writes one as keys.json")
     chosen = settings.replace(
-        data={name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
+        data={
+            name: value
+            for name, value in (("host", request.host), ("port", request.port), ("store", request.store))
+            if value is not None
+        }
     )
-    for file in (args.keys, args.announce):
+    for file in (request.keys, request.announce):
         if file is not None and not file.absolute().parent.is_dir():
             raise UsageError(f"there is no folder {file.absolute().parent}", hint="create the folder")
     from rse_pf.data_server.server import KeysFile, serve_data
 
-    store, keys = open_data_store(chosen), KeysFile(args.keys)
-    return serve_data(chosen, store, keys=keys, announce=args.announce, audit=args.audit)
+    store, keys = open_data_store(chosen), KeysFile(request.keys)
+    return serve_data(chosen, store, keys=keys, announce=request.announce, audit=request.audit)
+
+
+ACTION = Action(request=DataRequest, run=run_data)

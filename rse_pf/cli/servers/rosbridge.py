@@ -8,37 +8,46 @@ example:
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ROBOTS_PATH, ROSBRIDGE_PORT
 from rse_pf.errors import UsageError
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--url", metavar="URL",
+@dataclass(frozen=True, kw_only=True)
+class RosbridgeRequest:
+    """The platform, and the address at which rosbridge clients connect."""
+
+    url: str | None = option(
+        "--url",
+        metavar="URL",
         help="address of the platform (default: the backend server of this machine, at serving.port)",
-    )  # fmt: skip
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
-    parser.add_argument(
-        "--port", type=int, default=ROSBRIDGE_PORT, metavar="P",
+    )
+    host: str = option("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+    port: int = option(
+        "--port",
+        default=ROSBRIDGE_PORT,
+        metavar="P",
         help="port to listen on; 0 takes a free one (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--announce", type=Path, metavar="FILE", help="file that gets pid and port when clients can connect"
+    )
+    announce: Path | None = option(
+        "--announce", metavar="FILE", help="write pid and port to FILE when clients can connect"
     )
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def run_rosbridge(request: RosbridgeRequest, settings: PlatformSettings) -> int:
     """Serve until a signal ends the process."""
-    if args.announce is not None and not args.announce.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.announce.absolute().parent}", hint="create the folder")
+    if request.announce is not None and not request.announce.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {request.announce.absolute().parent}", hint="create the folder")
     from rse_pf.extensions.rosbridge.server import serve_rosbridge
 
-    url = args.url or f"ws://127.0.0.1:{settings.serving.port}{ROBOTS_PATH}"
-    return serve_rosbridge(settings, url=url, host=args.host, port=args.port, announce=args.announce)
+    url = request.url or f"ws://127.0.0.1:{settings.serving.port}{ROBOTS_PATH}"
+    return serve_rosbridge(settings, url=url, host=request.host, port=request.port, announce=request.announce)
+
+
+ACTION = Action(request=RosbridgeRequest, run=run_rosbridge)

@@ -10,13 +10,15 @@ example:
 
 from __future__ import annotations
 
-import argparse
 import os
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.auth.trust_store import TrustStore
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import UsageError
@@ -25,93 +27,115 @@ from rse_pf.extensions.recording.writer import with_recordings
 if TYPE_CHECKING:
     from rse_pf.server.worker_context import ServerRecorder
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
-_PLACEMENT: dict[str, type] = {
-    "host": str, "port": int, "control_host": str, "control_port": int, "workers": int, "store": str,
-    "live_host": str,
-}  # fmt: skip
+_ROWS = {(row.group, row.name): row for row in setting_rows()}
+
+
+def _setting(name: str, flag: str = "") -> Any:
+    """Return the option that overrides the setting *name*, written ``group.name``."""
+    row = _ROWS[tuple(name.split("."))]  # type: ignore[index]
+    unit = f" [{row.unit}]" if row.unit else ""
+    return option(
+        flag or f"--{row.name.replace('_', '-')}",
+        choices=row.choices or None,
+        metavar=None if row.choices else row.name.rpartition("_")[2].upper(),
+        help=f"{row.doc}{unit} ({name}, default {row.default})",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServeRequest:
+    """Where a backend server listens, whom it trusts, and what it records and runs."""
+
+    settings: Path | None = None
+    host: str | None = _setting("serving.host")
+    port: int | None = _setting("serving.port")
+    control_host: str | None = _setting("serving.control_host")
+    control_port: int | None = _setting("serving.control_port")
+    workers: int | None = _setting("serving.workers")
+    store: str | None = _setting("data.store")
+    live_host: str | None = _setting("live.host", "--live-host")
+    emulated_cores: float | None = _setting("serving.emulated_cores")
+    log_level: str | None = _setting("serving.log_level")
+    keys: Path | None = option(
+        "--keys",
+        metavar="FILE",
+        help="public keys of the tokens, a JWKS; the folder control/ next to it holds roster and deny list",
+    )
+    control_token: Path | None = option(
+        "--control-token",
+        metavar="FILE",
+        help="require the token in FILE on the control port, except for its two health pages",
+    )
+    server_id: str | None = option(
+        "--server-id", metavar="NAME", help="name of this server (default: server-PID)"
+    )
+    announce: Path | None = option(
+        "--announce", metavar="FILE", help="write pids and ports to FILE when the server is ready"
+    )
+    audit: Path | None = option(
+        "--audit", metavar="DIR", help="write the audit log of accepted and refused robots to DIR"
+    )
+    record: Path | None = option(
+        "--record",
+        metavar="DIR",
+        help="record the messages of robots and servers in DIR, for rse-pf replay (recording.folder)",
+    )
+    record_key: Path | None = option(
+        "--record-key",
+        metavar="FILE",
+        help="key of the pseudonyms in recordings, the same for all servers (default: one of its own)",
+    )
+    services: Path | None = option(
+        "--services", metavar="DIR", help="run the services installed in DIR (services.folder)"
+    )
+    follow_services: Path | None = option(
+        "--follow-services",
+        metavar="LINK",
+        help="run the services in the folder that the symbolic link LINK names, and load them again when "
+        "the control port requests it (services.follow); services that cannot be loaded are left out",
+    )
+    accept_weak_isolation: bool = option(
+        "--accept-weak-isolation",
+        help="run services even if this kernel lacks a kind of isolation (services.accept_weak_isolation)",
+    )
+    conformance_echo: bool = option(
+        "--conformance-echo", help="echo raw messages without tokens, on loopback only"
+    )
+
+
+_PLACEMENT = ("host", "port", "control_host", "control_port", "workers", "store", "live_host")
 """Options that override the placement in the settings file."""
-_ROWS = {"store": ("data", "store"), "live_host": ("live", "host")}
-"""Options that are no settings of the group serving."""
-_SETTINGS: dict[str, type] = {"emulated_cores": float, "log_level": str}
+_SETTINGS = ("emulated_cores", "log_level")
 """Options that override settings of the same name."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    rows = {(row.group, row.name): row for row in setting_rows()}
-    for name, kind in {**_PLACEMENT, **_SETTINGS}.items():
-        row = rows[_ROWS.get(name, ("serving", name))]
-        unit = f" [{row.unit}]" if row.unit else ""
-        parser.add_argument(
-            f"--{name.replace('_', '-')}", type=kind, choices=row.choices or None,
-            metavar=None if row.choices else name.rpartition("_")[2].upper(),
-            help=f"{row.doc}{unit} ({row.group}.{row.name}, default {row.default})",
-        )  # fmt: skip
-    parser.add_argument(
-        "--keys", type=Path, metavar="FILE",
-        help="public keys of the tokens, a JWKS; roster and deny list are beside it in control/",
-    )  # fmt: skip
-    parser.add_argument(
-        "--control-token", type=Path, metavar="FILE",
-        help="require the token in FILE on the control port, but for its two health pages",
-    )  # fmt: skip
-    parser.add_argument("--server-id", metavar="NAME", help="name of this server (default: server-PID)")
-    parser.add_argument(
-        "--announce", type=Path, metavar="FILE", help="write pids and ports to FILE when all is ready"
-    )
-    parser.add_argument("--audit", type=Path, metavar="DIR", help="record accepted and refused robots in DIR")
-    parser.add_argument(
-        "--record", type=Path, metavar="DIR",
-        help="record what robots and servers say in DIR, for rse-pf replay (recording.folder)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--record-key", type=Path, metavar="FILE",
-        help="key of the pseudonyms in recordings, the same for all servers (default: one of its own)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--services", type=Path, metavar="DIR", help="run the services installed in DIR (services.folder)"
-    )
-    parser.add_argument(
-        "--follow-services", type=Path, metavar="LINK",
-        help="run the services in the folder that LINK leads to, and load them anew when the control port is "
-        "told to (services.follow); those that cannot be loaded are left out",
-    )  # fmt: skip
-    parser.add_argument(
-        "--accept-weak-isolation", action="store_true",
-        help="run them even if this kernel lacks a kind of isolation (services.accept_weak_isolation)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--conformance-echo", action="store_true", help="echo raw messages without tokens, loopback only"
-    )
-
-
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def run_server(request: ServeRequest, settings: PlatformSettings) -> int:
     """Serve until a drain or a signal ends it."""
     services: dict[str, object] = {}
-    if args.services is not None and args.follow_services is not None:
+    if request.services is not None and request.follow_services is not None:
         raise UsageError("--services and --follow-services exclude each other", hint="leave one of them out")
-    if args.services is not None:
-        services["folder"] = str(args.services.absolute())
-    if args.follow_services is not None:
-        services.update(folder=str(args.follow_services.absolute()), follow=True)
-    if args.accept_weak_isolation:
+    if request.services is not None:
+        services["folder"] = str(request.services.absolute())
+    if request.follow_services is not None:
+        services.update(folder=str(request.follow_services.absolute()), follow=True)
+    if request.accept_weak_isolation:
         services["accept_weak_isolation"] = True
-    chosen = settings.replace(serving=_given(args, _SETTINGS), services=services)
-    if args.record is not None:
-        chosen = with_recordings(chosen, args.record)
-    placement = ServerPlacement.read(args.settings, chosen, **_given(args, _PLACEMENT))
-    server_id = f"server-{os.getpid()}" if args.server_id is None else args.server_id
+    chosen = settings.replace(serving=_given(request, _SETTINGS), services=services)
+    if request.record is not None:
+        chosen = with_recordings(chosen, request.record)
+    placement = ServerPlacement.read(request.settings, chosen, **_given(request, _PLACEMENT))
+    server_id = f"server-{os.getpid()}" if request.server_id is None else request.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
         raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")
-    token = None if args.control_token is None else read_control_token(args.control_token)
-    if args.announce is not None and not args.announce.absolute().parent.is_dir():
+    token = None if request.control_token is None else read_control_token(request.control_token)
+    if request.announce is not None and not request.announce.absolute().parent.is_dir():
         raise UsageError(
-            f"there is no folder {args.announce.absolute().parent}",
+            f"there is no folder {request.announce.absolute().parent}",
             hint="make it, or name another --announce",
         )
-    trust = None if args.keys is None else _trust(args.keys)
+    trust = None if request.keys is None else _trust(request.keys)
     from rse_pf.server.supervisor import serve
 
     return serve(
@@ -119,11 +143,11 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         placement=placement,
         trust=trust,
         server_id=server_id,
-        announce=args.announce,
-        conformance_echo=args.conformance_echo,
-        audit=args.audit,
+        announce=request.announce,
+        conformance_echo=request.conformance_echo,
+        audit=request.audit,
         control_token=token,
-        recorder=_recorder(chosen, server_id, args.record_key),
+        recorder=_recorder(chosen, server_id, request.record_key),
     )
 
 
@@ -135,8 +159,8 @@ def _recorder(settings: PlatformSettings, server_id: str, key: Path | None) -> S
     return FileServerRecorder(settings, server_id, key)
 
 
-def _given(args: argparse.Namespace, options: dict[str, type]) -> dict[str, object]:
-    return {name: getattr(args, name) for name in options if getattr(args, name) is not None}
+def _given(request: ServeRequest, options: Iterable[str]) -> dict[str, object]:
+    return {name: getattr(request, name) for name in options if getattr(request, name) is not None}
 
 
 def _trust(keys: Path) -> TrustStore:
@@ -148,3 +172,6 @@ def _trust(keys: Path) -> TrustStore:
             hint="name a JWKS; rse-pf local writes one as keys.json",
         ) from error
     return TrustStore(keys)
+
+
+ACTION = Action(request=ServeRequest, run=run_server)

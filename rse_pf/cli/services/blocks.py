@@ -6,22 +6,24 @@ or the one whose port is named.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
 from rse_pf.auth.control_token import read_control_token
+from rse_pf.command_line.options import option
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.terminal import show
 
-__all__ = ["Server", "add_block_arguments", "choose_servers", "show_blocks", "unblock"]
+__all__ = ["Server", "ServersRequest", "UnblockRequest", "choose_servers", "show_blocks", "unblock"]
 
 _TIMEOUT_S = 5.0
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -30,31 +32,36 @@ Server = tuple[str, int, str | None]
 """What it is called, its control port, and the token of that port."""
 
 
-def add_block_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of both actions."""
-    parser.add_argument(
-        "--tenant", help=f"unblock: only for this tenant (with --robot, default: {DEFAULT_TENANT})"
+@dataclass(frozen=True, kw_only=True)
+class ServersRequest:
+    """The servers that are asked: those of a local platform, or one by its control port."""
+
+    name: str = option("--name", default="default", help="name of the local platform (default: %(default)s)")
+    control_port: int | None = option(
+        "--control-port",
+        metavar="PORT",
+        help="ask the server on this machine with this control port, not a local platform",
     )
-    parser.add_argument("--robot", metavar="NAME", help="unblock: only for this robot of the tenant")
-    parser.add_argument(
-        "--control-port", type=int, metavar="PORT",
-        help="status, unblock: ask the server on this machine with this control port, "
-        "not a local platform",
-    )  # fmt: skip
-    parser.add_argument(
-        "--control-token",
-        type=Path,
-        metavar="FILE",
-        help="status, unblock: token file of that server",
+    control_token: Path | None = option(
+        "--control-token", metavar="FILE", help="token file of the server with --control-port"
     )
-    parser.add_argument(
-        "--url", help="status, unblock: the same as --control-port, as in http://127.0.0.1:PORT"
-    )
+    url: str | None = option("--url", help="the same as --control-port, as in http://127.0.0.1:PORT")
 
 
-def show_blocks(args: argparse.Namespace) -> int:
+@dataclass(frozen=True, kw_only=True)
+class UnblockRequest(ServersRequest):
+    """What is no longer refused: of a service, a tenant or a robot, or all of it."""
+
+    service: str | None = option(nargs="?", metavar="SERVICE", help="only this service (default: all)")
+    tenant: str | None = option(
+        "--tenant", help=f"only for this tenant (with --robot, default: {DEFAULT_TENANT})"
+    )
+    robot: str | None = option("--robot", metavar="NAME", help="only for this robot of the tenant")
+
+
+def show_blocks(request: ServersRequest, settings: PlatformSettings) -> int:
     """Show what is refused, to whom, and for how long; return 1 if a server did not answer."""
-    answers, silent = asyncio.run(_ask_all(choose_servers(args), "GET", "/blocks"))
+    answers, silent = asyncio.run(_ask_all(choose_servers(request), "GET", "/blocks"))
     rows = [_row(server, block) for server, answer in answers for block in answer["blocks"]]
     left_out = sum(answer["count"] - len(answer["blocks"]) for _, answer in answers)
     if rows:
@@ -66,13 +73,13 @@ def show_blocks(args: argparse.Namespace) -> int:
     return _show_silent(silent, answers)
 
 
-def unblock(args: argparse.Namespace) -> int:
+def unblock(request: UnblockRequest, settings: PlatformSettings) -> int:
     """Lift what is refused, and show what it was; return 1 if a server did not answer."""
-    tenant = args.tenant or (DEFAULT_TENANT if args.robot else None)
-    wanted = {"service": args.what, "tenant": tenant, "robot": args.robot}
+    tenant = request.tenant or (DEFAULT_TENANT if request.robot else None)
+    wanted = {"service": request.service, "tenant": tenant, "robot": request.robot}
     query = urlencode({name: value for name, value in wanted.items() if value})
     target = f"/unblock?{query}" if query else "/unblock"
-    answers, silent = asyncio.run(_ask_all(choose_servers(args), "POST", target))
+    answers, silent = asyncio.run(_ask_all(choose_servers(request), "POST", target))
     for server, answer in answers:
         for block in answer["blocks"]:
             _, service, whom, why, _ = _row(server, block)
@@ -85,23 +92,23 @@ def unblock(args: argparse.Namespace) -> int:
     return _show_silent(silent, answers)
 
 
-def choose_servers(args: argparse.Namespace) -> list[Server]:
+def choose_servers(request: ServersRequest) -> list[Server]:
     """Return the servers that the options name: those of a platform, or one by its control port.
 
     Raises:
         UsageError: There is none, the port or address is none, or a token file is refused.
     """
-    named = args.control_port if args.url is None else _port_of(args.url)
+    named = request.control_port if request.url is None else _port_of(request.url)
     if named is not None:
         if not 0 < named < 65536:
             raise UsageError(f"{named} is no port", hint="name a port from 1 to 65535")
-        token = None if args.control_token is None else read_control_token(args.control_token)
+        token = None if request.control_token is None else read_control_token(request.control_token)
         return [(f"port {named}", named, token)]
-    state = read_state(state_folder(args.name, os.environ))
+    state = read_state(state_folder(request.name, os.environ))
     servers = [] if state is None else [server for server in state.servers if server.control_port]
     if state is None or not servers:
         raise UsageError(
-            f"no server of a platform named {args.name!r} is running",
+            f"no server of a platform named {request.name!r} is running",
             hint="start one with: rse-pf local; for a server of rse-pf serve, name its --control-port",
         )
     token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None

@@ -10,8 +10,11 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+from rse_pf.command_line.options import option
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.local.state import state_folder
 from rse_pf.services.custom.cpp import INCLUDE_FOLDER
@@ -25,29 +28,35 @@ from rse_pf.services.custom.dependencies import (
 from rse_pf.services.custom.installed import InstalledService, read_service
 from rse_pf.terminal import at_work, counted, show
 
-__all__ = ["build_service", "built_service", "changed_s", "lock_service"]
+__all__ = ["FolderRequest", "build_service", "built_service", "changed_s", "lock_service"]
 
 
-def lock_service(source: Path) -> int:
-    """Lock the packages of the service in *source*, and show what was chosen."""
+@dataclass(frozen=True, kw_only=True)
+class FolderRequest:
+    """The folder of a service."""
+
+    folder: Path = option(metavar="FOLDER", help="folder of the service")
+
+
+def lock_service(request: FolderRequest, settings: PlatformSettings) -> None:
+    """Lock the packages of a service, and show what was chosen."""
+    source = request.folder
     _check_language(read_service(source))
     with at_work("resolving versions"):
         chosen = lock_dependencies(source)
     for each in chosen:
         show(f"{each.name}=={each.version}")
     show(f"{counted(len(chosen), 'package')} locked for {platform_tag()} in {source / LOCK_FILE}")
-    return 0
 
 
-def build_service(source: Path) -> int:
-    """Build the service in *source*, and say what it runs with."""
-    service, dependencies = built_service(source)
+def build_service(request: FolderRequest, settings: PlatformSettings) -> None:
+    """Build a service, and show its packages."""
+    service, dependencies = built_service(request.folder)
     if dependencies is None:
         show(f"{service.name} has no packages of its own")
-        return 0
+        return
     listed = ", ".join(f"{name} {version}" for name, version in sorted(dependencies.packages.items()))
     show(f"{service.name} has {listed}", f"digest {dependencies.digest[:16]}, in {dependencies.folder}")
-    return 0
 
 
 def built_service(source: Path) -> tuple[InstalledService, Dependencies | None]:

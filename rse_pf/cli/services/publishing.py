@@ -5,13 +5,14 @@ Servers look for changes every 15 seconds and load them while robots are connect
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from rse_pf.cli.services.building import built_service
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
@@ -26,37 +27,40 @@ from rse_pf.services.custom.publishing import (
 from rse_pf.storage.object_store import ObjectStore
 from rse_pf.terminal import show, show_json
 
-__all__ = ["add_publish_arguments", "publish_service"]
+__all__ = ["PublishRequest", "publish_service"]
 
 
-def add_publish_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of publish."""
-    parser.add_argument("--list", action="store_true", help="publish: show the services that all servers run")
-    parser.add_argument(
-        "--remove", action="store_true", help="publish: take the service with this name out of the list"
+@dataclass(frozen=True, kw_only=True)
+class PublishRequest:
+    """The service that is published or removed, or a list of what is published."""
+
+    service: str | None = option(
+        nargs="?", metavar="FOLDER", help="folder of the service; with --remove its name"
     )
-    parser.add_argument("--json", action="store_true", help="publish --list: as JSON")
+    list: bool = option("--list", help="show the services that all servers run")
+    remove: bool = option("--remove", help="remove the service with this name from the list")
+    json: bool = option("--json", help="with --list: print JSON")
 
 
-def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int:
+def publish_service(request: PublishRequest, settings: PlatformSettings) -> int:
     """Publish the service in a folder, remove one, or list them."""
-    if args.list and (args.remove or args.what is not None):
+    if request.list and (request.remove or request.service is not None):
         raise UsageError("--list takes no service and no --remove", hint="rse-pf service publish --list")
-    if not args.list and args.what is None:
+    if request.json and not request.list:
+        raise UsageError("--json is for --list", hint="leave it out")
+    require("service publish")
+    if request.list:
+        return _list(_store(settings), as_json=request.json)
+    if request.service is None:
         raise UsageError(
             "rse-pf service publish needs the folder of a service",
             hint="write rse-pf service publish FOLDER, or --list",
         )
-    if args.json and not args.list:
-        raise UsageError("--json is for --list", hint="leave it out")
-    require("service publish")
-    if args.list:
-        return _list(_store(settings), as_json=args.json)
-    if args.remove:
-        unpublish(args.what, _store(settings))
-        show(f"{args.what} is removed: servers stop offering it within {LIST_POLL_PERIOD_S} s")
+    if request.remove:
+        unpublish(request.service, _store(settings))
+        show(f"{request.service} is removed: servers stop offering it within {LIST_POLL_PERIOD_S} s")
         return 0
-    built, dependencies = built_service(Path(args.what))
+    built, dependencies = built_service(Path(request.service))
     with tempfile.TemporaryDirectory(prefix="rse-pf-publish-") as folder:
         service = install(built.folder, Path(folder), dependencies)
         entry = publish(service, Path(folder), _store(settings), now_s=time.time())

@@ -26,7 +26,6 @@ examples:
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
@@ -36,17 +35,18 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rse_pf.cli.local_platform.logs import LogFollower, LogLine
-from rse_pf.cli.services.blocks import add_block_arguments, show_blocks, unblock
-from rse_pf.cli.services.building import build_service, built_service, changed_s, lock_service
-from rse_pf.cli.services.publishing import add_publish_arguments, publish_service
+from rse_pf.cli.services.blocks import ServersRequest, UnblockRequest, show_blocks, unblock
+from rse_pf.cli.services.building import FolderRequest, build_service, built_service, changed_s, lock_service
+from rse_pf.cli.services.publishing import PublishRequest, publish_service
 from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
@@ -56,84 +56,70 @@ from rse_pf.services.custom.output import format_output_line
 from rse_pf.storage.files import read_document
 from rse_pf.terminal import error_lines, show, show_json, show_progress
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["ACTION"]
 
-_ACTIONS = (
-    "new", "test", "run", "lock", "build", "install", "list", "call", "status", "unblock", "publish",
-)  # fmt: skip
-_OF_A_NAME = ("new", "call")
 _LANGUAGES = ("python", "cpp", "lua")
 _OUTPUT = re.compile(r"service-output robot=(?P<robot>\S+) text=(?P<text>.*) tenant=\S+")
 _POLL_S = 0.3
 _RECORDED_FIELDS = {"request", "reply", "tolerance", "failure"}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("action", choices=_ACTIONS, help="what to do")
-    parser.add_argument(
-        "what", nargs="?", metavar="NAME|FOLDER",
-        help="new, call: a name; test, run, lock, build, install, publish: the folder; "
-        "unblock: only this service; publish --remove: the name",
-    )  # fmt: skip
-    parser.add_argument(
-        "--lang", choices=_LANGUAGES, default="python", help="new: language (default: python)"
+@dataclass(frozen=True, kw_only=True)
+class _NewRequest:
+    name: str = option(metavar="NAME", help="name of the service, and of its folder")
+    lang: str = option("--lang", choices=_LANGUAGES, default="python", help="language (default: python)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RunRequest(FolderRequest):
+    once: bool = option("--once", help="answer the recorded requests, then exit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ListRequest:
+    services: Path | None = option(
+        "--services",
+        metavar="DIR",
+        help="folder of the installed services (default: services.folder, or that of rse-pf local)",
     )
-    parser.add_argument("--services", type=Path, metavar="DIR", help="install, list: the services folder")
-    parser.add_argument(
-        "--request", metavar="JSON|FILE",
-        help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request",
-    )  # fmt: skip
-    parser.add_argument(
-        "--name", default="default",
-        help="call, status, unblock: name of the local platform (default: default)",
-    )  # fmt: skip
-    add_block_arguments(parser)
-    add_publish_arguments(parser)
-    parser.add_argument("--once", action="store_true", help="run: answer the recorded requests, then end")
+
+    def services_folder(self, settings: PlatformSettings) -> Path:
+        if self.services is not None:
+            return self.services
+        if settings.services.folder:
+            return Path(settings.services.folder)
+        return state_folder("default", os.environ).parent / "services"
 
 
-def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Do one of the actions."""
-    without_what: dict[str, Callable[[], int]] = {
-        "list": lambda: _list(args.services or _services_folder(settings)),
-        "status": lambda: show_blocks(args),
-        "unblock": lambda: unblock(args),
-        "publish": lambda: publish_service(args, settings),
-    }
-    if args.action in without_what:
-        return without_what[args.action]()
-    if args.what is None:
-        what = "name" if args.action in _OF_A_NAME else "folder"
-        raise UsageError(
-            f"rse-pf service {args.action} needs the {what} of a service",
-            hint=f"write rse-pf service {args.action} {what.upper()}",
-        )
-    source = Path(args.what)
-    actions: dict[str, Callable[[], int]] = {
-        "new": lambda: _new(args.what, args.lang, Path.cwd()),
-        "call": lambda: asyncio.run(_call(args.what, args.request, args.name, settings)),
-        "install": lambda: _install(source, args.services or _services_folder(settings)),
-        "lock": lambda: lock_service(source),
-        "build": lambda: build_service(source),
-        "test": lambda: replay(built_service(source)[0], recorded_requests(source), settings),
-        "run": lambda: asyncio.run(_run(source, settings, once=args.once)),
-    }
-    if args.action == "run":
-        require("service")
-    return actions[args.action]()
+@dataclass(frozen=True, kw_only=True)
+class _InstallRequest(FolderRequest, _ListRequest):
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CallRequest:
+    service: str = option(metavar="NAME", help="name of the service")
+    request: str = option(
+        "--request",
+        default="{}",
+        metavar="JSON|FILE",
+        help="the request as JSON; @FILE reads it from a file, which may be a recorded request",
+    )
+    name: str = option("--name", default="default", help="name of the local platform (default: %(default)s)")
 
 
 # --- new, install, list ---------------------------------------------------------------------------
 
 
-def _new(name: str, language: str, where: Path) -> int:
+def create(request: _NewRequest, settings: PlatformSettings) -> None:
+    """Create the folder of a new service that works."""
+    name, language = request.name, request.lang
     if not NAME_PATTERN.fullmatch(name):
         raise UsageError(
             f"{name[:60]!r} is not a valid service name",
             hint="use 1 to 40 lower-case letters, digits, - and _",
         )
-    folder = where / name
+    folder = Path.cwd() / name
     if folder.exists():
         raise UsageError(f"{folder} exists already", hint="choose another name, or remove it")
     template = INCLUDE_FOLDER.parent / "templates" / language
@@ -150,33 +136,43 @@ def _new(name: str, language: str, where: Path) -> int:
         f"  rse-pf service test {name}     replay its recorded request",
         f"  rse-pf service run {name}      serve it, and load every saved change",
     )
-    return 0
 
 
-def _install(source: Path, folder: Path) -> int:
-    built, dependencies = built_service(source)
+def install_service(request: _InstallRequest, settings: PlatformSettings) -> None:
+    """Copy a service to the installed ones."""
+    folder = request.services_folder(settings)
+    built, dependencies = built_service(request.folder)
     service = install(built.folder, folder, dependencies)
     show(
         f"{service.name} ({service.language}) is installed in {folder}",
         f"serve it with: rse-pf local --services {folder}",
     )
-    return 0
 
 
-def _list(folder: Path) -> int:
-    for service in installed_services(folder):
+def list_services(request: _ListRequest, settings: PlatformSettings) -> None:
+    """Show the services that are installed."""
+    for service in installed_services(request.services_folder(settings)):
         about = f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.identity[:12]}"
         show(f"{about}  {service.folder}")
-    return 0
 
 
-def _services_folder(settings: PlatformSettings) -> Path:
-    if settings.services.folder:
-        return Path(settings.services.folder)
-    return state_folder("default", os.environ).parent / "services"
+def test(request: FolderRequest, settings: PlatformSettings) -> int:
+    """Replay the recorded requests of a service in a sandbox; return 1 if an answer is wrong."""
+    return replay(built_service(request.folder)[0], recorded_requests(request.folder), settings)
 
 
 # --- run, call --------------------------------------------------------------------------------------
+
+
+def run(request: _RunRequest, settings: PlatformSettings) -> int:
+    """Serve a service from a local platform, and load every saved change."""
+    require("service")
+    return asyncio.run(_run(request.folder, settings, once=request.once))
+
+
+def call(request: _CallRequest, settings: PlatformSettings) -> None:
+    """Send a request to a service of a running local platform, and print the reply."""
+    show_json(plain(asyncio.run(_call(request.service, request.request, request.name, settings))))
 
 
 async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
@@ -202,7 +198,7 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
                 good = await _ask_recorded(platform, service, recorded, settings)
                 if once:
                     return 0 if good else 1
-                show(f"save a file in {source} to load it anew; Ctrl-C ends")
+                show(f"save a file in {source} to load it again; Ctrl-C ends")
                 changed_at_s = changed_s(service.folder)
                 while not stopped.is_set():
                     _show_output(output)
@@ -275,7 +271,7 @@ async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, setting
     return not failed
 
 
-async def _call(name: str, request: str | None, platform: str, settings: PlatformSettings) -> int:
+async def _call(name: str, request: str, platform: str, settings: PlatformSettings) -> Any:
     from client_sdk import connect
     from rse_pf.local.firewall import key_file, read_key
 
@@ -288,12 +284,10 @@ async def _call(name: str, request: str | None, platform: str, settings: Platfor
     )
     async with connect(state.url, token=token) as robot:
         answer = await robot.call(name, payload)
-    show_json(plain(answer.reply))
-    return 0
+    return answer.reply
 
 
-def _payload(request: str | None) -> Any:
-    text = request or "{}"
+def _payload(text: str) -> Any:
     hint = "write --request '{\"points\": [0, 0, 1]}'"
     if text.startswith("@"):
         payload = read_document(Path(text[1:]), "JSON", hint=hint)
@@ -305,3 +299,75 @@ def _payload(request: str | None) -> Any:
     if isinstance(payload, dict) and "request" in payload and set(payload) <= _RECORDED_FIELDS:
         return payload["request"]
     return payload
+
+
+ACTION = Action(
+    actions={
+        "new": Action(
+            help="create the folder of a service that works",
+            example="rse-pf service new centroid --lang lua",
+            request=_NewRequest,
+            run=create,
+        ),
+        "test": Action(
+            help="replay the recorded requests of a service in a sandbox",
+            example="rse-pf service test centroid",
+            request=FolderRequest,
+            run=test,
+        ),
+        "run": Action(
+            help="serve a service from a local platform until Ctrl-C, and load every saved change",
+            example="rse-pf service run centroid",
+            request=_RunRequest,
+            run=run,
+        ),
+        "lock": Action(
+            help="write versions and hashes of the service's Python packages to requirements.txt",
+            example="rse-pf service lock centroid",
+            request=FolderRequest,
+            run=lock_service,
+        ),
+        "build": Action(
+            help="install the Python packages of a service, or compile C and C++",
+            example="rse-pf service build centroid",
+            request=FolderRequest,
+            run=build_service,
+        ),
+        "install": Action(
+            help="copy a service to the installed ones, for rse-pf local --services",
+            example="rse-pf service install centroid",
+            request=_InstallRequest,
+            run=install_service,
+        ),
+        "list": Action(
+            help="show the installed services",
+            example="rse-pf service list",
+            request=_ListRequest,
+            run=list_services,
+        ),
+        "call": Action(
+            help="send a request to a service of a running local platform",
+            example="rse-pf service call centroid --request @requests/example.json",
+            request=_CallRequest,
+            run=call,
+        ),
+        "status": Action(
+            help="show which services and requests are refused to whom after crashes",
+            example="rse-pf service status",
+            request=ServersRequest,
+            run=show_blocks,
+        ),
+        "unblock": Action(
+            help="accept again what is refused after crashes",
+            example="rse-pf service unblock centroid --robot robot-1",
+            request=UnblockRequest,
+            run=unblock,
+        ),
+        "publish": Action(
+            help="publish a service to all servers on AWS, list them, or remove one",
+            example="rse-pf service publish centroid",
+            request=PublishRequest,
+            run=publish_service,
+        ),
+    },
+)

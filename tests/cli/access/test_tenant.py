@@ -102,17 +102,17 @@ def test_a_quota_of_one_tenant_of_a_cloud_holds_at_once(capsys: Capture, cloud: 
 @pytest.mark.parametrize(
     ("words", "first"),
     [
-        ("tenant quota", "quota needs one"),
-        ("tenant quota acme", "quota needs one"),
-        ("tenant list acme", "list takes no tenant"),
-        ("tenant list --quota data_bytes=1", "list takes no tenant"),
+        ("tenant quota", "arguments are required: TENANT, --quota"),
+        ("tenant quota acme", "arguments are required: --quota"),
+        ("tenant list acme", "unrecognized arguments: acme"),
+        ("tenant list --quota data_bytes=1", "unknown option --quota"),
         ("tenant quota acmee --quota data_bytes=1e6", "there is no tenant 'acmee'"),
         ("tenant quota acme --quota data_bytes=much", "'data_bytes=much' is not a quota"),
         ("tenant quota acme --quota data_bytes=inf", "is not above 0"),
         ("tenant quota acme --quota data_bytes=0", "is not above 0"),
         ("tenant quota acme --quota bytes=default", "'bytes' is not a quota"),
         ("tenant list --name nowhere", "no platform"),
-        ("robot quota robot-1 --tenant acme", "--quota is for enrol and for quota"),
+        ("robot quota robot-1 --tenant acme", "arguments are required: --quota"),
         ("robot quota robot-1 --quota data_bytes=5", "is of tenant 'acme', and not of 'default'"),
     ],
 )
