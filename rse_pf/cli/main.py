@@ -51,15 +51,32 @@ VERBS = {
 }
 """Verb and one line of help."""
 
-_FOLDERS = {
-    "local": "local_platform", "fleet": "local_platform",
-    "token": "access", "tenant": "access", "robot": "access", "audit": "access",
-    "service": "services",
-    "serve": "servers", "data": "servers", "rosbridge": "servers",
-    "camera": "maps", "map": "maps",
-    "cloud": "cloud",
-}  # fmt: skip
-"""Folder of a verb whose module does not lie beside this one."""
+_MODULES = {
+    "demo": "rse_pf.extensions.experiments.demo.command",
+    "check": "rse_pf.extensions.check.command",
+    "compare": "rse_pf.extensions.experiments.compare.command",
+    "experiment": "rse_pf.extensions.experiments.paper.command",
+    "local": "rse_pf.cli.local_platform.local",
+    "fleet": "rse_pf.extensions.fleet_page.command",
+    "swarm": "rse_pf.extensions.experiments.load.command",
+    "token": "rse_pf.cli.access.token",
+    "tenant": "rse_pf.cli.access.tenant",
+    "robot": "rse_pf.cli.access.robot",
+    "service": "rse_pf.cli.services.service",
+    "serve": "rse_pf.cli.servers.serve",
+    "data": "rse_pf.cli.servers.data",
+    "rosbridge": "rse_pf.extensions.rosbridge.command",
+    "camera": "rse_pf.cli.maps.camera",
+    "map": "rse_pf.cli.maps.map",
+    "batch": "rse_pf.extensions.batch.command",
+    "replay": "rse_pf.extensions.recording.replay.command",
+    "audit": "rse_pf.cli.access.audit",
+    "cloud": "rse_pf.cli.cloud.cloud",
+    "settings": "rse_pf.cli.settings",
+    "doctor": "rse_pf.cli.doctor",
+    "errors": "rse_pf.cli.errors",
+}
+"""Module of each verb, by name, so that only the module of the verb that runs is imported."""
 
 _EXIT_OK, _EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED, _EXIT_PIPE = 0, 1, 2, 130, 141
 _REFUSED = re.compile(r"[a-z]+\.(?P<name>[a-z_]+) = .* is (below|above|not one of) ")
@@ -98,8 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def verb_module(name: str) -> Any:
     """Import and return the module of the verb *name*."""
-    package = f"rse_pf.cli.{_FOLDERS[name]}" if name in _FOLDERS else "rse_pf.cli"
-    return importlib.import_module(f"{package}.{name}")
+    return importlib.import_module(_MODULES[name])
 
 
 def parser_of(name: str) -> Parser:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
-from rse_pf.cli import experiment
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.experiments.paper import command as experiment
 
 
 def test_a_folder_with_other_files_is_not_touched(tmp_path, capsys):

@@ -81,7 +81,9 @@ def half_a_complaint(command: str) -> str:
     _, verb, *words = shlex.split(command)
     if verb not in VERBS:
         return "no verb"
-    actions = parser_of(verb)._actions
+    parser = parser_of(verb)
+    words = [parser.default_action, *words] if words[:1] and words[0].startswith("-") else words
+    actions = parser._actions
     known = {option for action in actions for option in action.option_strings}
     choices = next((each.choices for each in actions if not each.option_strings and each.choices), None)
     subparsers = [each.choices for each in actions if isinstance(each, argparse._SubParsersAction)]

@@ -469,7 +469,7 @@ class _Extras(NamedTuple):
 async def _foreground(
     name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, extras: _Extras
 ) -> int:  # fmt: skip
-    from rse_pf.cli.local_platform.page import page_beside, process_beside
+    from rse_pf.extensions.fleet_page.page_process import page_beside, process_beside
     from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform

@@ -40,8 +40,8 @@ from rse_pf.cli.maps.bags import FromBagRequest, ToBagRequest, export_bag, run_f
 from rse_pf.cli.maps.from_camera import FromCameraRequest, run_from_camera
 from rse_pf.cli.maps.live import LIVE_ACTIONS, run_publish
 from rse_pf.cli.maps.localise import LocaliseRequest, run_localise
-from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.command_line.map_store import MapRequest, StoreRequest, VersionRequest
+from rse_pf.command_line.merge_output import commit_merge, merge_progress
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.cli import experiment
+from rse_pf.extensions.experiments.paper import command as experiment
 from rse_pf.extensions.experiments.paper.verify import read_report, report_folders, verify
 from rse_pf.extensions.experiments.results.rerun import rerun_arguments, rerun_figures
 
@@ -32,7 +32,7 @@ def test_every_figure_that_is_shipped_agrees_with_its_records(folder: Path):
 def test_a_report_reaches_the_figures_of_its_own_short_form(folder: Path):
     report = read_report(folder)
 
-    assert experiment._Parser.parsed(rerun_arguments(report)).kind == report["experiment"]
+    assert experiment._parse_short_form(rerun_arguments(report)).kind == report["experiment"]
     assert [figure.name for figure in rerun_figures(report, report) if not figure.is_reached] == []
 
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from rse_pf.cli.local_platform.local import DEFAULT_NAME
 from rse_pf.command_line.extras import require
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
@@ -26,6 +25,8 @@ from rse_pf.terminal import show, show_json
 
 __all__ = ["ACTION"]
 
+_DEFAULT_NAME = "default"
+
 _MAX_PORT = 65535
 
 
@@ -33,7 +34,9 @@ _MAX_PORT = 65535
 class FleetRequest:
     """The platform whose page is shown, and whether the page may operate it."""
 
-    name: str = option("--name", default=DEFAULT_NAME, help=f"name of the platform (default: {DEFAULT_NAME})")
+    name: str = option(
+        "--name", default=_DEFAULT_NAME, help=f"name of the platform (default: {_DEFAULT_NAME})"
+    )
     operate: bool = option("--operate", help="the page may operate the platform")
     json: bool = option("--json", help="print JSON")
     cloud: bool = option("--cloud", help="show the deployment on AWS in cloud.region")
@@ -49,7 +52,7 @@ def show_page_address(request: FleetRequest, settings: PlatformSettings) -> int:
     if request.port is not None:
         raise UsageError("--port is for --cloud", hint="the port of a local page: local.page_port")
     require("fleet")
-    from rse_pf.cli.local_platform.page import new_address
+    from rse_pf.extensions.fleet_page.page_process import new_address
     from rse_pf.local.state import state_folder
 
     url = new_address(state_folder(request.name, os.environ), "operate" if request.operate else "view")

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
-from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.merge_output import commit_merge, merge_progress
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
