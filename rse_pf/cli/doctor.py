@@ -38,7 +38,7 @@ _ISOLATION_FIX = "allow user namespaces: sysctl -w user.max_user_namespaces=1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One line: ``grade`` is ok, warn or fail; ``fix`` says what to do unless it is ok."""
+    """One line: ``grade`` is ok, warn or fail; ``fix`` is how to repair it, empty if it is ok."""
 
     grade: str
     what: str

@@ -25,8 +25,8 @@ from rse_pf.terminal import show, show_error, show_page
 __all__ = ["VERBS", "main", "parser_of", "verb_module"]
 
 VERBS = {
-    "demo": "let robots build point-cloud maps through the platform, on this machine",
-    "check": "say what is wrong with a drive: calibration, depth, times, images, axes",
+    "demo": "run robots that build point-cloud maps through a platform on this machine",
+    "check": "find what is wrong with a drive: calibration, depth, times, images, axes",
     "compare": "compare configurations of the tracker on recordings: errors, bytes, CPU time",
     "experiment": "repeat the experiments of Section 6 of the paper, or verify a run from its records",
     "local": "run the platform on this machine: load balancer and backend servers",

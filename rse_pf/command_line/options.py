@@ -138,6 +138,7 @@ def add_action(parser: Parser, action: Action) -> None:
         parser.set_defaults(chosen=action)
         return
     parser.default_action = action.default
+    parser.epilog = f"{parser.prog} ACTION --help shows the options of an action"
     subparsers = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     for name, each in action.actions.items():
         made = subparsers.add_parser(

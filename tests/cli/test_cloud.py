@@ -203,8 +203,8 @@ def test_the_status_of_an_ill_fleet_leads_to_the_runbook(
     assert main(["cloud", "status"]) == 1
 
     page = capsys.readouterr().out
-    assert "robots: not told" in page
-    assert "no server told" in page
+    assert "robots: not reported" in page
+    assert "no server has reported" in page
     assert "docs/operations.md#unhealthy" in page
 
 

@@ -95,6 +95,6 @@ def confirmed(request: ChangeRequest, question: str = "go on?") -> bool:
 
 
 def perform(steps: Sequence[Step], world: StepContext) -> None:
-    """Carry out *steps*, and tell each."""
+    """Carry out *steps*, and show each."""
     show("doing:")
     carry_out(steps, world)

@@ -1,4 +1,4 @@
-"""Run the platform on AWS: what a deployment lacks, what it costs, its health, and what was left behind.
+"""Run the platform on AWS: deploy it, park it, show its health and its cost, and destroy it.
 
 examples:
   rse-pf cloud up

@@ -151,7 +151,7 @@ def _show_alternatives(bill: Bill, settings: PlatformSettings, prices: Prices, l
 
 
 ACTION = Action(
-    help="what a load costs a month, line by line, on the fleet and on the Lambda",
+    help="show what a load costs a month, on the fleet and on the Lambda",
     request=CostRequest,
     run=show_costs,
 )

@@ -104,7 +104,7 @@ def _show_kept(proof: Proof, *, is_over: bool) -> None:
 
 
 ACTION = Action(
-    help="destroy the platform, and prove that nothing is left but what is kept",
+    help="destroy the platform, and list what is left and what is kept on purpose",
     request=DownRequest,
     run=take_down,
 )

@@ -35,5 +35,5 @@ def show_leftovers(request: NoOptions, settings: PlatformSettings) -> int:
 
 
 ACTION = Action(
-    help="resources in the account that belong to no stack", request=NoOptions, run=show_leftovers
+    help="list the resources in the account that belong to no stack", request=NoOptions, run=show_leftovers
 )

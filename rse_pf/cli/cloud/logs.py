@@ -62,7 +62,7 @@ def show_logs(request: LogsRequest, settings: PlatformSettings) -> int:
 
 
 ACTION = Action(
-    help="what a server logged, also one that is gone, and what a failed boot wrote",
+    help="show what a server logged, also one that was removed, and the console of a failed boot",
     request=LogsRequest,
     run=show_logs,
 )

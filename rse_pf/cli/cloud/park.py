@@ -51,5 +51,5 @@ def park(request: ParkRequest, settings: PlatformSettings) -> int:
 
 
 ACTION = Action(
-    help="end all servers until resume; the data and the load balancer stay", request=ParkRequest, run=park
+    help="stop all servers until resume; the data and the load balancer stay", request=ParkRequest, run=park
 )

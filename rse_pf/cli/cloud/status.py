@@ -33,15 +33,18 @@ def show_status(request: NoOptions, settings: PlatformSettings) -> int:
     )
     for server in fleet.servers:
         health = ", ".join(server.targets) or "in no target group"
-        robots = "robots: not told" if server.robots is None else counted(int(server.robots), "robot")
+        robots = "robots: not reported" if server.robots is None else counted(int(server.robots), "robot")
         show(f"  {server.name}  {server.zone}  {server.state:<12}  {health:<20}  {robots}")
     if fleet.robots:
-        told = fleet.robots
-        of = f" of {len(fleet.servers)}" if len(told) < len(fleet.servers) else ""
-        servers = "server" if len(told) == 1 and not of else "servers"
-        show(f"{sum(told):g} robots on {len(told)}{of} {servers}, {min(told):g} to {max(told):g} on each")
+        reported = fleet.robots
+        of = f" of {len(fleet.servers)}" if len(reported) < len(fleet.servers) else ""
+        servers = "server" if len(reported) == 1 and not of else "servers"
+        show(
+            f"{sum(reported):g} robots on {len(reported)}{of} {servers}, "
+            f"{min(reported):g} to {max(reported):g} on each"
+        )
     else:
-        show("robots: no server told how many it has")
+        show("robots: no server has reported its number")
     for name, state in sorted(fleet.alarms.items()):
         hint = f"  docs/operations.md#{name}" if state == "ALARM" else ""
         show(f"  alarm {name:<12} {state}{hint}")
@@ -59,13 +62,11 @@ def _show_stage(deployment: Deployment, settings: PlatformSettings) -> None:
         servers = sum(group.instances for group in deployment.groups.values())
         more = max(0, servers - settings.scaling.min_servers)
         hourly = bills[deployment.stage].total / HOURS + more * costs.server_per_hour(settings)
-        show(
-            f"costs {hourly:.2f} {costs.prices.currency} an hour now, beside robots' requests and stored data"
-        )
+        show(f"costs {hourly:.2f} {costs.prices.currency} an hour now, plus robots' requests and stored data")
     else:
         show("costs nothing but stored data: rse-pf cloud down lists it")
     if deployment.url and note is None:
         show(deployment.url)
 
 
-ACTION = Action(help="servers, their health, alarms, robots", request=NoOptions, run=show_status)
+ACTION = Action(help="show servers, their health, alarms and robots", request=NoOptions, run=show_status)

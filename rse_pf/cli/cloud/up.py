@@ -80,7 +80,7 @@ def _findings(account: Account, settings: PlatformSettings) -> Iterator[Finding]
 
 
 ACTION = Action(
-    help="put the platform up, bring it up to date, or finish what was begun",
+    help="deploy the platform, update it, or finish a deployment that was interrupted",
     request=changing.ChangeRequest,
     run=bring_up,
 )

@@ -23,7 +23,7 @@ def upgrade_servers(request: NoOptions, settings: PlatformSettings) -> int:
             sleep=time.sleep, now=lambda: datetime.now(timezone.utc),
         )  # fmt: skip
     except KeyboardInterrupt:
-        show("", "AWS goes on without this command; run it again to follow")
+        show("", "AWS continues without this command; run it again to follow")
         return 1
     if ended.reason:
         show(

@@ -1,4 +1,4 @@
-"""What rse-pf local --lan tells its operator: addresses, authority, enrolment and firewall."""
+"""What rse-pf local --lan prints: addresses, authority, enrolment and firewall."""
 
 from __future__ import annotations
 

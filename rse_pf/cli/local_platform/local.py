@@ -460,7 +460,7 @@ def _wait(end_s: float, seconds: float) -> bool:
 
 
 class _Extras(NamedTuple):
-    """The processes beside a platform: fleet page, burst function (None: none)."""
+    """Optional processes of a platform: fleet page, burst function (None: none)."""
 
     page: bool
     burst_port: int | None
@@ -469,7 +469,7 @@ class _Extras(NamedTuple):
 async def _foreground(
     name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, extras: _Extras
 ) -> int:  # fmt: skip
-    from rse_pf.extensions.fleet_page.page_process import page_beside, process_beside
+    from rse_pf.extensions.fleet_page.page_process import run_beside_platform, run_page
     from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
@@ -504,13 +504,13 @@ async def _foreground(
         async with platform:
             ready = True
             _show_welcome(platform, name)
-            beside = page_beside(folder, settings.local.page_port, _show_page)
-            burst = process_beside(
+            page = run_page(folder, settings.local.page_port, _show_page)
+            burst = run_beside_platform(
                 "lambda_pnp.local_front", folder, extras.burst_port or 0, folder / "burst.log",
                 lambda url: show(f"burst function      {url}"),
             )  # fmt: skip
             async with (
-                beside if extras.page else nullcontext(),
+                page if extras.page else nullcontext(),
                 burst if extras.burst_port else nullcontext(),
             ):  # fmt: skip
                 await stopped.wait()

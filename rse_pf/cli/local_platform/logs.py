@@ -67,7 +67,7 @@ class LogLine:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogFilter:
     """Which lines are wanted: least level, earliest Unix time, robot, tenant, and the process that wrote a
-    line or that it is about; an empty name is any.  What befell a server concerns every tenant.
+    line or that it is about; an empty name is any.  An event of a server concerns every tenant.
     """
 
     level: str = "debug"

@@ -2,7 +2,7 @@
 
 SOURCE is a device number (0), a video, images, a folder or a recording.  calibrate writes intrinsics.json,
 which every command that opens a camera reads.  With --board it looks for a board; a board of 9x6 has 9 by 6
-inner corners.  Without, it calibrates by what a moving camera sees, such as an old recording.
+inner corners.  Without --board it uses the motion of the camera in a video or recording.
 
 examples:
   rse-pf camera board --board 9x6 --square-mm 25 --out board.pdf
@@ -40,7 +40,7 @@ __all__ = ["ACTION"]
 
 _WANTED_VIEWS = 25
 _LIVE_IMAGES = 3000
-"""A live calibration ends after so many images even if there are too few views."""
+"""A calibration with a device ends after this number of images even if there are too few views."""
 
 
 @dataclass(frozen=True, kw_only=True)

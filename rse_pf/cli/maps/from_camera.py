@@ -1,7 +1,7 @@
 """Make a map from a camera: ``rse-pf map from-camera``.
 
-Starts a platform on this machine unless it is told of another one, tracks the camera until it ends or Ctrl-C
-is pressed, and writes map, trajectory, report and picture.
+Starts a platform on this machine unless another one is named, tracks the camera until it ends or Ctrl-C is
+pressed, and writes map, trajectory, report and picture.
 """
 
 from __future__ import annotations
@@ -259,7 +259,7 @@ def map_source(
 
 
 def offset_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the line that tells how a stereo drive was moved when it was saved; none if it was not."""
+    """Return the line about a stereo drive that was corrected when it was saved; none if it was not."""
     offset_px, deviation_px = (report.get(f"disparity_offset{each}_px") for each in ("", "_deviation"))
     if not offset_px:
         return []
@@ -270,7 +270,7 @@ def offset_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the line that tells the error of a path; none without a truth, or without a scale."""
+    """Return the line with the error of a path; none without a ground truth, or without a scale."""
     if report.get("ate_cm") is None:
         return []
     rpe = "" if report["rpe_cm"] is None else f", RPE {report['rpe_cm']:.2f} cm"

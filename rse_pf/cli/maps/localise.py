@@ -34,7 +34,7 @@ __all__ = ["LocaliseRequest", "run_localise"]
 
 _FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
 _MAX_PHOTO_BYTES = 1 << 26
-"""The platform says what it takes; this only keeps a wrong file out of memory."""
+"""Largest file that is read, in bytes: the platform has a limit of its own, this one protects memory."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Work with the maps that robots share: show, merge, prune, back up, localise in them, roll them back.
 
-Works on the store itself (--store; by default data.store, else that of the platform on this machine, where
-from-camera and from-bag keep their maps).  A VERSION is head, or six or more digits of an id; show --all
+The actions work on the store itself: --store, else data.store, else that of the platform on this machine,
+where from-camera and from-bag keep their maps.  A VERSION is head, or six or more digits of an id; show --all
 lists the ids.  rollback sets the head to an earlier version and deletes nothing; prune removes old versions.
 Each action has its own help page: rse-pf map merge --help.
 

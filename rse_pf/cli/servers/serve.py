@@ -2,7 +2,7 @@
 
 The control port answers /healthz, /readyz, /metrics and /status.  With --control-token, only the first two
 are answered without that token.  SIGTERM drains the server: its robots move to other servers, and no command
-is lost.  Ctrl-C ends it at once.  To run a whole platform, use rse-pf local.
+is lost.  Ctrl-C stops it at once.  To run a whole platform, use rse-pf local.
 
 example:
   rse-pf serve --keys keys.json --port 0 --announce server.json

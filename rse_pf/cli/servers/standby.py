@@ -1,9 +1,9 @@
 """A warm standby: it has imported what `rse-pf serve` needs, and becomes a server when it gets its arguments.
 
 Started by the local platform as ``python -m rse_pf.cli.servers.standby``.  It imports in a thread of low
-priority, because servers work beside it, and prints a line when it is warm.  One JSON line on its standard
-input holds the arguments and the log of the server; from then on it works at full priority.  It ends when
-that input ends without a line.
+priority, because servers work at the same time, and prints a line when it is warm.  One JSON line on its
+standard input holds the arguments and the log of the server; from then on it works at full priority.  It
+exits when that input ends without a line.
 """
 
 from __future__ import annotations

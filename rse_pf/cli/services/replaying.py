@@ -57,7 +57,7 @@ def replay(service: InstalledService, recorded: Recorded, settings: PlatformSett
         show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
     wrong = 0
     for (name, each), each_run in zip(recorded, runs, strict=True):
-        problem, detail = _judge(each, each_run.answer)
+        problem, detail = _find_problem(each, each_run.answer)
         wrong += problem
         show(f"{name:<28} {'WRONG' if problem else 'ok':<6} {each_run.took_ms:8.1f} ms  {detail}".rstrip())
     show(f"{len(runs) - wrong} of {counted(len(runs), 'recorded request')} as expected")
@@ -76,8 +76,8 @@ def _read_request(path: Path) -> dict[str, Any]:
     return found
 
 
-def _judge(expected: Mapping[str, Any], answer: Any) -> tuple[bool, str]:
-    """Return whether *answer* is wrong, and what to say about it."""
+def _find_problem(expected: Mapping[str, Any], answer: Any) -> tuple[bool, str]:
+    """Return whether *answer* is wrong, and a description of it."""
     from rse_pf.wire import Failure
 
     if isinstance(answer, Failure):

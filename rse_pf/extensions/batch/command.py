@@ -1,8 +1,8 @@
 """Merge maps that outgrow one process: in parts, by worker processes here or by those of a Dask scheduler.
 
 Finished parts are kept in the store of the maps, so that the same command continues after an interruption: a
-worker that ends is replaced, a scheduler that ends is started again, and Ctrl-C or a crash of this machine
-lose at most the parts that were being computed.  The result is that of rse-pf map merge, plus links from
+worker that exits is replaced, a scheduler that exits is started again, and Ctrl-C or a crash of this machine
+lose at most the parts that were being computed.  The result is that of rse-pf map merge, plus edges from
 aligned clouds (--no-icp leaves them out).  --scheduler uses the workers of a Dask scheduler that runs.
 
 examples:

@@ -1,1 +1,4 @@
-"""The verb check, which tracks a drive on this machine and shows what `client_sdk.check` finds wrong."""
+"""The verb check, which tracks a drive on this machine and shows what is wrong with it.
+
+How faults are found belongs to `client_sdk.check`.
+"""

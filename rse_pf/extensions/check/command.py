@@ -1,8 +1,8 @@
-"""Say what is wrong with a drive: calibration, depth, times, images, axes; by how much, and what to do.
+"""Find what is wrong with a drive: calibration, depth, times, images, axes; by how much, and what to do.
 
 SOURCE is a recording, a ROS bag, a folder of images, a video, a device, or the results of a map that was
-checked while it was made.  The whole of it is tracked here; no platform is needed.  Findings are worst first;
-what this drive cannot tell is said with the reason.  The exit code is 1 if something is wrong.
+checked while it was made.  All frames are tracked on this machine, without a platform.  The worst findings
+come first; what this drive cannot show is listed with the reason.  The exit code is 1 if something is wrong.
 
 examples:
   rse-pf check recordings/kitchen
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ACTION"]
 
-_MOST_LIVE = 3000
-"""A device is looked at for so many frames unless --frames says another number."""
+_MAX_DEVICE_FRAMES = 3000
+"""Number of frames of a device that are checked unless --frames gives another number."""
 _OF_RECORDINGS = ("rgb.txt", "intrinsics.json", "metadata.yaml")
 """Folders with one of these are recordings or bags, whatever report somebody left in them."""
 
@@ -90,22 +90,22 @@ def check_drive(request: CheckDriveRequest, settings: PlatformSettings) -> int:
                 f"cannot make {request.out}: {error.strerror}", hint="name another --out"
             ) from error
     report, own, shown = _checked(request, settings)
-    told = report.to_dict()
+    document = report.to_dict()
     if request.out is not None:
-        replace_file(request.out / "report.json", (json.dumps(told, indent=2) + "\n").encode())
+        replace_file(request.out / "report.json", (json.dumps(document, indent=2) + "\n").encode())
     written = [] if request.write is None else _write(request.write, report, own)
     if request.json:
-        show_json(told, indent=2)
+        show_json(document, indent=2)
     else:
-        show(*check_lines(told, is_whole=True, shown=shown), *written)
+        show(*check_lines(document, is_whole=True, shown=shown), *written)
     return 1 if report.findings or report.doubts or report.poses == 0 else 0
 
 
 def _show_results(request: CheckDriveRequest, file: Path) -> int:
     """Show what was found while a map was made: its results have no images."""
     report = read_document(file, "a report of a map", hint="check the recording itself")
-    told = report.get("check") if isinstance(report, dict) else None
-    if not isinstance(told, dict):
+    document = report.get("check") if isinstance(report, dict) else None
+    if not isinstance(document, dict):
         raise UsageError(
             f"{request.source} was not checked while it was made, and its results have no images",
             hint="check the recording itself; only maps of cameras, recordings and bags are checked",
@@ -115,15 +115,15 @@ def _show_results(request: CheckDriveRequest, file: Path) -> int:
     if given is not None:
         raise UsageError(f"results of a map are shown only: no --{given}", hint="check the recording itself")
     if request.json:
-        show_json(told, indent=2)
+        show_json(document, indent=2)
     else:
-        show(*_lines_of_results(told, file))
-    return 1 if told.get("findings") or told.get("source") or told.get("poses") == 0 else 0
+        show(*_lines_of_results(document, file))
+    return 1 if document.get("findings") or document.get("source") or document.get("poses") == 0 else 0
 
 
-def _lines_of_results(told: Mapping[str, Any], file: Path) -> list[str]:
+def _lines_of_results(document: Mapping[str, Any], file: Path) -> list[str]:
     try:
-        return check_lines(told, is_whole=True)
+        return check_lines(document, is_whole=True)
     except (TypeError, ValueError, AttributeError, MemoryError) as error:
         raise UsageError(f"{file} is not a report of a map", hint="check the recording itself") from error
 
@@ -149,7 +149,7 @@ def _checked(
             camera=request.camera,
             imu=request.imu,
         ) as source:
-            most = request.frames or (_MOST_LIVE if str(request.source).isdigit() else None)
+            most = request.frames or (_MAX_DEVICE_FRAMES if str(request.source).isdigit() else None)
             log = _compared(source.log, reference, source.span_s)
             shown = show_source(source.notes, unresolved(log.doubts, request.accept))
             report = _watched(
@@ -211,7 +211,7 @@ def _watched(
 ) -> CheckReport:
     """Track all frames in this process, and return what is wrong with them.
 
-    A source that fails ends the drive; what was seen before is judged.
+    A source that fails ends the drive; what was seen before is checked.
     """
     from client_sdk.check.observer import DriveObserver
     from client_sdk.mapper import Mapper

@@ -1,4 +1,4 @@
-"""The fleet page of a local platform: a process beside the control plane, and new addresses of it."""
+"""The fleet page of a local platform: its process, and new addresses of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.extensions.fleet_page.server import ANNOUNCEMENT, page_url
 from rse_pf.local.state import control_token_file
 
-__all__ = ["new_address", "page_beside", "process_beside"]
+__all__ = ["new_address", "run_beside_platform", "run_page"]
 
 _LOG = "fleet_page.log"
 _END_S = 3.0
@@ -25,17 +25,17 @@ _TIMEOUT_S = 5.0
 
 
 @contextlib.asynccontextmanager
-async def page_beside(folder: Path, port: int, told: Callable[[str], None]) -> AsyncIterator[None]:
-    """Run the page of the platform in *folder*; its address is told when it serves."""
-    async with process_beside("rse_pf.extensions.fleet_page", folder, port, folder / _LOG, told):
+async def run_page(folder: Path, port: int, on_address: Callable[[str], None]) -> AsyncIterator[None]:
+    """Run the page of the platform in *folder*; *on_address* gets its address when it serves."""
+    async with run_beside_platform("rse_pf.extensions.fleet_page", folder, port, folder / _LOG, on_address):
         yield
 
 
 @contextlib.asynccontextmanager
-async def process_beside(
-    module: str, folder: Path, port: int, log_file: Path, told: Callable[[str], None]
+async def run_beside_platform(
+    module: str, folder: Path, port: int, log_file: Path, on_address: Callable[[str], None]
 ) -> AsyncIterator[None]:
-    """Run a module beside the platform in *folder*; it prints its address, which is told.
+    """Run a module in addition to the platform in *folder*; *on_address* gets the address that it prints.
 
     The platform is not delayed by it, and does not end with it.
     """
@@ -45,11 +45,11 @@ async def process_beside(
             "--parent", str(os.getpid()), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
             stderr=log, start_new_session=True,
         )  # fmt: skip
-    telling = asyncio.ensure_future(_tell(process, told))
+    reader = asyncio.ensure_future(_read_address(process, on_address))
     try:
         yield
     finally:
-        telling.cancel()
+        reader.cancel()
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
         try:
@@ -92,8 +92,8 @@ def new_address(folder: Path, role: str) -> str:
         connection.close()
 
 
-async def _tell(process: asyncio.subprocess.Process, told: Callable[[str], None]) -> None:
+async def _read_address(process: asyncio.subprocess.Process, on_address: Callable[[str], None]) -> None:
     assert process.stdout is not None
     line = await process.stdout.readline()
     with contextlib.suppress(ValueError, KeyError):
-        told(str(json.loads(line)["url"]))
+        on_address(str(json.loads(line)["url"]))

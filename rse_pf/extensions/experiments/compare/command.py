@@ -3,7 +3,7 @@
 CONFIG is built in (default, live, wide-baseline, without-depth, features-500), a file NAME.toml or NAME.py
 with options and functions of your own, or module:function for features.  A recording is a folder in the
 layout of TUM, EuRoC or KITTI, NYU Depth V2, a ROS bag, or world:SEED, which is rendered.  Poses are solved in
-this process, so that every run gives the same.
+this process, so that every run gives the same result.
 
 examples:
   rse-pf compare --data world:3

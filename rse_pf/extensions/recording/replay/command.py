@@ -156,8 +156,8 @@ def _show_overview(overview: Overview, request: ReplayRequest) -> None:
     if not bad:
         show("no command went wrong; whether calibration, times and images are right, rse-pf check says")
         return
-    told = ", ".join(f"{count} {kind}" for kind, count in overview.by_kind.items())
-    show("", f"went wrong: {told}; worst first:")
+    counts = ", ".join(f"{count} {kind}" for kind, count in overview.by_kind.items())
+    show("", f"went wrong: {counts}; worst first:")
     for trouble in overview.troubles:
         show(f"  {trouble.kind:<10} {trouble.id}  {trouble.robot}  {trouble.what}")
     if bad > len(overview.troubles):
