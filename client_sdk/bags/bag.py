@@ -32,8 +32,6 @@ from client_sdk.bags.index import (
     BagIndex,
     CameraTimes,
     ImageStamps,
-    nearest_gap_s,
-    pair_stamps,
     read_index,
 )
 from client_sdk.bags.lens import lens_of
@@ -60,6 +58,7 @@ from client_sdk.source_facts import (
     check_source,
     median_depth_m,
 )
+from client_sdk.stamp_pairs import nearest_gap_s, pair_stamps
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, Lens, inverse

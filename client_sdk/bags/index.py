@@ -22,11 +22,9 @@ from client_sdk.bags.imu import ImuReadings
 from client_sdk.bags.lens import numbers_of
 from client_sdk.bags.poses import PoseTopic, TransformTree
 
-__all__ = ["BagIndex", "CameraTimes", "ImageStamps", "nearest_gap_s", "pair_stamps", "read_index"]
+__all__ = ["BagIndex", "CameraTimes", "ImageStamps", "read_index"]
 
 Stamps = npt.NDArray[np.int64]
-_Times = npt.NDArray[Any]
-"""Of one unit, in whole numbers or not."""
 
 
 _MAX_STEP_MISMATCH = 0.5
@@ -197,29 +195,3 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
         uses_log_time=no_stamps,
         cameras=cameras,
     )
-
-
-def pair_stamps(first: _Times, second: _Times, within: float) -> list[tuple[int, int]]:
-    """Return ``(row of first, row of second)``, nearest in time, each row at most once; both must ascend."""
-    if not len(first) or not len(second):
-        return []
-    nearest = _nearest(first, second)
-    apart = np.abs(second[nearest] - first)
-    best: dict[int, tuple[float, int]] = {}
-    for row in np.flatnonzero(apart <= within):
-        partner = int(nearest[row])
-        if partner not in best or apart[row] < best[partner][0]:
-            best[partner] = (apart[row], int(row))
-    return sorted((row, partner) for partner, (_, row) in best.items())
-
-
-def nearest_gap_s(first: Stamps, second: Stamps) -> float:
-    """Return the smallest time between a stamp of one and a stamp of the other, seconds."""
-    return float(np.abs(second[_nearest(first, second)] - first).min()) / 1e9
-
-
-def _nearest(first: _Times, second: _Times) -> Stamps:
-    """Return for each of *first* the row of the nearest of *second*."""
-    after = np.minimum(np.searchsorted(second, first), len(second) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(first - second[before]) <= np.abs(second[after] - first), before, after)

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from client_sdk.bags.index import pair_stamps
 from client_sdk.cameras.source import RawFrame, RawPair
 from client_sdk.datasets.images import (
     image_files,
@@ -42,6 +41,7 @@ from client_sdk.source_facts import (
     some_names,
     stamps_in_seconds,
 )
+from client_sdk.stamp_pairs import pair_stamps
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.bags import Bag, BagOptions, is_bag, lens_or_rig, open_bag
-from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.images import check_size, probe, probe_size_px, read_colour, read_depth
@@ -39,6 +38,7 @@ from client_sdk.source_facts import (
     rows_in_time,
     stamps_in_seconds,
 )
+from client_sdk.stamp_pairs import pair_stamps
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, Lens

@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.images import check_size, image_files, probe_size_px, read_colour
 from client_sdk.frontend import Frame, load_opencv
@@ -42,6 +41,7 @@ from client_sdk.source_facts import (
     some_names,
     stamps_in_seconds,
 )
+from client_sdk.stamp_pairs import pair_stamps
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, from_quaternion

@@ -1,4 +1,4 @@
-"""Which settings of scaling and capacity contradict each other; every refusal says what to change."""
+"""Refuse settings of scaling and capacity that contradict each other."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def _check_periods(scaling: Mapping[str, Any]) -> None:
     fast = scaling["profile"] == "fast"
     period_s = FAST_PERIOD_S if fast else scaling["period_s"]
     if scaling["idle_s"] % period_s:
-        told = f"the {FAST_PERIOD_S} s of the fast profile" if fast else f"scaling.period_s = {period_s}"
+        allowed = f"the {FAST_PERIOD_S} s of the fast profile" if fast else f"scaling.period_s = {period_s}"
         raise SettingsError(
-            f"scaling.idle_s = {scaling['idle_s']} is no multiple of {told}",
+            f"scaling.idle_s = {scaling['idle_s']} is no multiple of {allowed}",
             hint=f"make it a multiple {WHERE}",
         )

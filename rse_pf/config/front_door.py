@@ -1,9 +1,8 @@
-"""How many requests of one address the web firewall lets pass.
+"""Rate limits of the web firewall for each source address, and limits of HTTP at the load balancer.
 
-Many robots may share an address: those of one site stand behind one router.  The limit of each rule is what
-the robots of a site do at the most, computed from the numbers by which they bound themselves; so robots that
-all lose their connection at the same moment stay below it.  Pure arithmetic: the stacks write these rules
-down, and tests play them.
+The robots of one site share an address, because they are behind one router.  Each rate limit is the most that
+the robots of a site send by their own limits, so robots that lose their connection at the same moment stay
+below it.  The stacks turn these rules into rules of AWS WAF.
 """
 
 from __future__ import annotations
@@ -34,35 +33,37 @@ BALANCER_IDLE_TIMEOUT_S = 120
 """How long the load balancer on AWS keeps a silent connection; robots ping far more often."""
 
 BODY_TIMEOUT_S = 10.0
-"""A request body of the data service that pauses for longer is refused; the local balancer waits three times
-as long."""
+"""Longest pause within a request body of the data service; the local load balancer allows thrice this."""
 MAX_HANDSHAKE_BYTES = 8192
-"""Request head of a handshake; load balancer and server refuse a longer one with 431 (OWASP, slowloris)."""
-# A client with more unsent bytes than this counts as a slow reader; its answers in flight are fewer.
+"""Longest request head of a handshake; longer ones are answered with 431 (OWASP, slowloris)."""
 WRITE_BUFFER_BYTES = 262_144
+"""Unsent bytes above which a client counts as a slow reader; its answers in flight take less."""
 DIAL_BURST = 20
 """Attempts to connect that a robot may make at once."""
 DIALS_PER_MINUTE = 10.0
-"""Attempts to connect of a robot after the burst."""
+"""Attempts to connect of a robot in a minute after the burst."""
 DATA_REQUESTS_PER_MINUTE = 600
-"""Data requests of one robot, averaged over the robots of a site; ``data.max_requests_per_s`` bounds each
-alone."""
-DATA_PATH, LOCALISE_PATH = "/data/", "/localise/"
-"""What the data servers answer."""
+"""Data requests of a robot, averaged over a site; ``data.max_requests_per_s`` limits each single robot."""
+DATA_PATH = "/data/"
+"""Paths of objects and maps, which the data servers answer."""
+LOCALISE_PATH = "/localise/"
+"""Paths of photos to localise, which the data servers answer."""
 BURST_PATH = "/burst"
-"""At the robots' address, where the serverless PnP answers."""
+"""Path at the robots' address that the serverless PnP answers."""
 BEARER_PATTERN = r"^[Bb]earer +[A-Za-z0-9_-]+\.[A-Za-z0-9_-]+\.[A-Za-z0-9_-]{86}$"
 """What the header Authorization looks like with a token: three parts, the last one an Ed25519 signature."""
 STATUS = 429
+"""Status of a refused request: Too Many Requests."""
 RETRY_AFTER_S = 60
-"""What an address above its limit is told: after one window without requests it is below."""
+"""Value of Retry-After in a refusal: after one window without requests an address is below its limit."""
 _ADDRESS_SHARE = 0.4
-"""Share of the burst commands of all robots that one address may send: a site cannot take all of them."""
+"""Share of the burst commands of all robots that one address may send, so that no site uses all of them."""
 _MINUTE_S = 60
-"""The shortest window that AWS WAF has, so that an address is free again soon."""
+"""The shortest window of AWS WAF, so that an address is accepted again soon."""
 _FIVE_MINUTES_S = 300
-_LEAST = 10
-"""AWS WAF accepts no lower limit."""
+"""Window of the limits of burst commands, which are set for five minutes."""
+_MIN_LIMIT = 10
+"""The lowest limit that AWS WAF accepts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,8 +84,8 @@ class RateRule:
 def rate_rules(settings: PlatformSettings) -> tuple[RateRule, ...]:
     """Return the rules, in the order in which they are applied.
 
-    Dials are what is neither data nor burst, so that a path that is written in an unusual way counts in the
-    strictest rule.
+    Dials are all requests that are neither data nor burst, so that an unusual path counts in the strictest
+    rule.
     """
     robots, burst = settings.cloud.robots_per_site, settings.burst
     dials = robots * (DIAL_BURST + DIALS_PER_MINUTE)
@@ -109,4 +110,4 @@ def rate_rules(settings: PlatformSettings) -> tuple[RateRule, ...]:
 
 
 def _limit(requests: float) -> int:
-    return max(_LEAST, math.ceil(requests))
+    return max(_MIN_LIMIT, math.ceil(requests))

@@ -1,6 +1,6 @@
-"""Where one server runs: what differs from server to server while the settings are the same.
+"""The placement of one server: the settings that differ between servers of the same platform.
 
-A settings file may hold a placement beside the settings, for the servers of one machine; options of
+A settings file may hold a placement next to the settings, for the servers of one machine; options of
 ``rse-pf serve`` override it.  The digest of the settings does not depend on it.
 """
 
@@ -76,9 +76,9 @@ class ServerPlacement:
 
 
 def live_ports(live: LiveSettings) -> range:
-    """Return the ports on which owners of live maps listen on ``live.host``; port 0 takes any free one.
+    """Return the ports on which the map servers of live maps listen on ``live.host``; 0 takes a free one.
 
-    Where other machines connect the ports are known beforehand, so that a firewall can name them.
+    If other machines connect, the ports are fixed, so that a firewall can name them.
     """
     if is_loopback(live.host) or not live.first_port:
         return range(1)

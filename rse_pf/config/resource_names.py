@@ -1,7 +1,7 @@
 """Names of the resources of a deployment that both the stacks and other programs use.
 
-Promises to import nothing, and to read no setting: constants are the same in every deployment, and
-`ResourceNames` makes the others of the deployment's name.
+Constants are the same in every deployment; `ResourceNames` derives the other names from that of the
+deployment.  This module imports nothing of the platform and reads no setting.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ __all__ = [
 DEPLOYMENT_TAG = "rse-pf"
 """Key of the tag of every resource; its value is `ResourceNames.prefix`."""
 HEALTH_PATH = "/healthz"
-"""At the robots' port, where it tells everybody that robots are served, and nothing else; below ``/data`` at
-the data service, where load balancers ask it whether the process is alive."""
+"""Health check of the robots' port, without a token: it shows only that robots are served.  Below ``/data``
+it is the health check of the data service."""
 READY_PATH = "/readyz"
-"""At the control port, where load balancers ask it; below ``/data`` at the data service, whether its store
-answers, which agents publish and for which no server is ended."""
-# Path of the robots' WebSocket.
+"""Readiness check of the control port by load balancers.  Below ``/data`` it shows whether the store of the
+data service answers; agents publish this, and no server is replaced because of it."""
 ROBOTS_PATH = "/ws"
+"""Path of the robots' WebSocket."""
 ROSBRIDGE_PATH = "/rosbridge"
-"""At the load balancer, where ``serving.rosbridge`` is on."""
+"""Path of rosbridge clients at the load balancer, if ``serving.rosbridge`` is set."""
 ROSBRIDGE_PORT = 8768
-"""Of the rosbridge server on a backend server; rosbridge_suite's 9090 is often taken on a robot's machine."""
+"""Port of the rosbridge server on a backend server; 9090 of rosbridge_suite is often taken on a robot."""
 KEYS_NAME = "keys.json"
 """Name of the object in the artifact bucket that holds the public key set."""
 ROBOTS_NAME = "control/robots.json"

@@ -55,8 +55,8 @@ from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.photos import PhotoLens
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import choose_superseded, count_freed_bytes
-from rse_pf.storage.charges import charge_name
 from rse_pf.storage.object_store import DirectoryStore, ObjectStore, PresigningStore
+from rse_pf.storage.quotas import charge_name
 
 __all__ = ["Handler", "Handlers", "MapWork"]
 

@@ -35,7 +35,7 @@ _MEMBER = re.compile(r"(?P<map>[a-z0-9][a-z0-9-]{0,63})/(?P<kind>blobs|versions)
 _CHARGE = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}/(?P<map>[a-z0-9-]{1,64})/(?P<id>[0-9a-f]{64})\.\d{1,15}"
 )
-"""Name of a charge (see `rse_pf.storage.charges`) without ``charges/TENANT/``: robot, map, id of the version
+"""Name of a charge (see `rse_pf.storage.quotas`) without ``charges/TENANT/``: robot, map, id of the version
 and size in bytes."""
 _MAX_RECORD_BYTES = 1 << 20
 """Largest size in bytes of the record of one version in a backup file: 1 MiB, though a record with many
@@ -57,7 +57,7 @@ class BackupContent(msgspec.Struct, frozen=True, kw_only=True):
         created_s: When the backup was written, Unix seconds.
         heads: The id of the head of each map, by the name of the map.
         charges: The charges of the versions: names of objects below ``charges/TENANT/``, see
-            `rse_pf.storage.charges`.
+            `rse_pf.storage.quotas`.
     """
 
     format: Literal["rse-pf-maps"] = "rse-pf-maps"

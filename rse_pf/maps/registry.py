@@ -29,8 +29,8 @@ from rse_pf.identity import name_segment
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.maps.record import MapRecord
 from rse_pf.maps.removal import HELD, MAX_REMOVAL_S, REMOVING, Marks
-from rse_pf.storage.charges import remove_charges
 from rse_pf.storage.object_store import ObjectStore, digest_of
+from rse_pf.storage.quotas import remove_charges
 
 if TYPE_CHECKING:  # Importing numpy takes a third of a data server's start, and only decoding a map needs it.
     from rse_pf.maps.format import Keyframe, MapVersion

@@ -1,18 +1,27 @@
-"""Limit the bytes that robots and tenants store: counted in one place, and reserved before they are written.
+"""Limit the bytes that robots and tenants store: the one account of storage, for all servers.
 
-A robot is charged with its objects, its unfinished uploads and the versions of maps that it committed.  Its
-tenant is charged with all of that and with what nobody alone owns: old and new versions of maps; logs,
-snapshots and features of live maps; states of services; jobs that wait.  Nothing is ever removed to make
-something fit, and to read or to remove is never refused.
+What counts:
 
-The bytes of a tenant count for all processes: ``accounts/TENANT`` holds what was counted last and what was
-granted since then, and changes by compare-and-swap.  A process draws a few MiB at a time and spends them from
-memory.  ``quotas/TENANT`` holds the quota that an operator gave to this tenant alone.  The bytes of
-a robot count for one process, which counts again what others stored every `_RECOUNT_S`
-in a folder (reading only what changed) and every `_SLOW_RECOUNT_S` in other stores.
+- for a robot: its objects, its unfinished uploads, and the versions of maps that it committed
+- for its tenant: all of these, and what no single robot owns, which is all versions of maps, the logs,
+  snapshots and features of live maps, the states of services, and waiting jobs
 
-On a disk with little free space each tenant may fill its share: what all tenants hold and what is free,
-divided by the number of tenants.  So a tenant that fills the disk is refused while others go on.
+Bytes are reserved before they are written.  Nothing is removed to make something fit; reading and removing
+are never refused.
+
+How it is counted:
+
+1. ``accounts/TENANT`` in the store holds the bytes that were counted last, and those granted since then.  It
+   changes by compare-and-swap, so it holds for all processes.
+2. A process draws a few MiB of a tenant at a time, and spends them from memory.
+3. The bytes of a robot are counted by each process for itself.  It counts again what other processes stored:
+   every `_RECOUNT_S` in a folder (reading only what changed), every `_SLOW_RECOUNT_S` in other stores.
+4. ``quotas/TENANT`` holds the quota that an operator gave to one tenant; without it the setting applies.
+5. ``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` is an empty object that counts one version of a map, of SIZE
+   bytes, for the robot that committed it.  Versions of live maps have none: no robot commits them.
+
+While the disk has little free space, a tenant may hold at most its share: the bytes of all tenants and the
+free bytes, divided by the number of tenants.  A tenant that fills the disk is refused, and others go on.
 """
 
 from __future__ import annotations
@@ -21,7 +30,7 @@ import contextlib
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -30,7 +39,6 @@ import msgspec
 from rse_pf.config import DataSettings
 from rse_pf.errors import Busy, Conflict, NotFound, QuotaExceeded, StoreError, StoreFull
 from rse_pf.identity import RobotId, name_segment
-from rse_pf.storage.charges import sum_charges
 from rse_pf.storage.object_store import (
     MIN_CHARGE_BYTES,
     DirectoryStore,
@@ -40,7 +48,8 @@ from rse_pf.storage.object_store import (
 )
 
 __all__ = [
-    "Accounts", "TenantAccount", "own_quota_bytes", "set_own_quota", "stored_by_tenant", "tenant_folders",
+    "Accounts", "TenantAccount", "charge_name", "own_quota_bytes", "remove_charges", "set_own_quota",
+    "stored_by_tenant", "sum_charges", "tenant_folders",
 ]  # fmt: skip
 
 _K = TypeVar("_K")
@@ -48,23 +57,22 @@ _T = TypeVar("_T")
 _RECOUNT_S = 10.0  # between two counts of a folder, which reads only what changed
 _SLOW_RECOUNT_S = 600.0  # between two counts of another store, which lists all objects
 _REFUSED_RECOUNT_SHARE = 0.1
-"""Before a refusal a tenant is counted again after this share of the usual time: it may have deleted."""
-_MAX_ACCOUNTS = 10_000
-_MAX_DRAWN_BYTES = 16 << 20  # bytes that a process draws from an account at once, at most
-_DRAWN_SHARE = 64  # it draws this fraction of what is left, so that a full account is shared finely
-_DRAWN_S = 5.0  # drawn bytes expire after this time, so that a process that ended holds none for long
-_WRITTEN_S = 15.0  # an object is written this long after its bytes were drawn, at the latest
-_SWAPS = 50
-_SHARE_S = 1.0
+"""Share of the usual time after which a tenant is counted again before a refusal: it may have deleted."""
+_MAX_ACCOUNTS = 10_000  # robots, and tenants, that a process remembers; others are counted anew
+_MAX_DRAWN_BYTES = 16 << 20  # most bytes that a process draws from an account at once
+_DRAWN_DIVISOR = 64  # a process draws 1/64 of what is left, so that several can share a nearly full account
+_DRAWN_S = 5.0  # drawn bytes expire after this time, so that a process that exited holds none for long
+_WRITTEN_S = 15.0  # an object is written at most this long after its bytes were drawn
+_MAX_SWAPS = 50  # attempts to change an account that other processes change at the same time
+_DISK_SHARE_S = 1.0  # how long the share of a nearly full disk is remembered: counting reads all tenants
 _RESERVE_SHARE = 0.1
-"""Share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than
-its share is refused."""
+"""Share of the disk below which a tenant that holds more than its share is refused."""
 _NEVER = float("-inf")
 _OF_TENANT = ("objects", "maps", "live", "states", "jobs")
 
 
 class _Ledger(msgspec.Struct, frozen=True, array_like=True):
-    """``accounts/TENANT``: bytes that were counted at Unix time *counted_s*, and what was granted since."""
+    """``accounts/TENANT``: the bytes at Unix time *counted_s*, and ``(time, bytes)`` of grants since then."""
 
     counted_s: float
     charged_bytes: int
@@ -128,7 +136,7 @@ class TenantAccount:
 
         Args:
             size: Of the object.
-            margin: Bytes that must be left besides, for what follows from it.
+            margin: Bytes that must stay free in addition, for what is written later because of the object.
             freed: Bytes that are removed when the object is written.
 
         Raises:
@@ -163,7 +171,7 @@ class TenantAccount:
 
     def _draw(self, charge: int, margin: int) -> int:
         """Grant *charge* bytes and some more to this process; return how many."""
-        for _ in range(_SWAPS):
+        for _ in range(_MAX_SWAPS):
             known = self._read()
             now = self._wall_clock()
             ledger = _ledger(known)
@@ -179,7 +187,7 @@ class TenantAccount:
                         self._store.compare_and_swap(self._name, known, _encode(ledger))
                 raise refused
             free_bytes = min(self.quota_bytes() - ledger.used_bytes - margin, self._free_bytes())
-            drawn = max(charge, min(_MAX_DRAWN_BYTES, int(free_bytes // _DRAWN_SHARE)))
+            drawn = max(charge, min(_MAX_DRAWN_BYTES, int(free_bytes // _DRAWN_DIVISOR)))
             try:
                 self._store.compare_and_swap(self._name, known, _encode(_with_grant(ledger, now, drawn)))
             except Conflict:
@@ -236,7 +244,7 @@ class TenantAccount:
         if not isinstance(self._store, DirectoryStore):
             return float("inf")
         now = self._wall_clock()
-        if 0.0 <= now - self._share_s < _SHARE_S:
+        if 0.0 <= now - self._share_s < _DISK_SHARE_S:
             return self._share_bytes
         folders = {self._folder, *tenant_folders(self._store)}
         held = sum(stored_by_tenant(self._store, folder, self._check).charged_bytes for folder in folders)
@@ -315,9 +323,53 @@ def _uploads(store: ObjectStore, folder: str, check: Callable[[], None]) -> Usag
     return total
 
 
+def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
+    """Return the name of the object that counts a version of a map for *robot*.
+
+    Args:
+        robot: The robot that committed the version.
+        map_name: Name of the map.
+        version: Id of the version.
+        size: Bytes that the version added to the store.
+    """
+    return f"charges/{robot.folder}/{map_name}/{version}.{size}"
+
+
+def sum_charges(store: ObjectStore, robot: RobotId, check: Callable[[], None] = lambda: None) -> Usage:
+    """Return the number and the charged bytes of all versions of maps that count for *robot*.
+
+    Args:
+        store: The store of the maps.
+        robot: The robot.
+        check: Called before each object; an error that it raises stops the work.
+    """
+    objects = charged_bytes = 0
+    for info in store.list(f"charges/{robot.folder}/"):
+        check()
+        objects += 1
+        charged_bytes += charge_of(int(info.name.rpartition(".")[2]))
+    return Usage(objects, charged_bytes)
+
+
+def remove_charges(store: ObjectStore, tenant: str, map_name: str, versions: Collection[str]) -> None:
+    """Delete the objects that count versions of a map for robots, so that no robot is charged any more.
+
+    Args:
+        store: The store of the maps.
+        tenant: Folder of the tenant.
+        map_name: Name of the map.
+        versions: Ids of the versions.
+    """
+    for robot in store.folders(f"charges/{tenant}/"):
+        prefix = f"charges/{tenant}/{robot}/{map_name}/"
+        for info in store.list(prefix):
+            if info.name.removeprefix(prefix).partition(".")[0] in versions:
+                store.delete(info.name)
+
+
 @dataclass(slots=True)
 class _RobotAccount:
-    """What is known about one robot; *lock* guards the rest."""
+    """The bytes of one robot; *lock* guards the other fields."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     counted_s: float = _NEVER

@@ -16,8 +16,8 @@ from rse_pf.identity import RobotId
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import ABANDONED_S, MAX_REMOVAL_S, Marks, choose_superseded, count_freed_bytes
-from rse_pf.storage.charges import charge_name, sum_charges
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore
+from rse_pf.storage.quotas import charge_name, sum_charges
 from tests.kit.fake_store import FakeStore
 from tests.kit.sample_maps import make_map
 

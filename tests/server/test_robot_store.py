@@ -10,9 +10,8 @@ from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
 from rse_pf.server.object_refs import ObjectRefs
 from rse_pf.server.robot_store import store_within_quota
-from rse_pf.storage.charges import charge_name
 from rse_pf.storage.object_store import MemoryStore
-from rse_pf.storage.quotas import Accounts
+from rse_pf.storage.quotas import Accounts, charge_name
 from rse_pf.wire import Failure, Result
 
 ROBOT = RobotId("default", "robot-1")

@@ -10,8 +10,8 @@ from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.cli.access.adopt import adopt
 from rse_pf.cli.main import main
 from rse_pf.identity import RobotId, object_name, state_name
-from rse_pf.storage.charges import charge_name
 from rse_pf.storage.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
+from rse_pf.storage.quotas import charge_name
 from tests.kit.fake_data_service import Service, small_settings
 
 Capture = pytest.CaptureFixture[str]

@@ -16,8 +16,8 @@ from rse_pf.local.firewall import ensure_key
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.maps.removal import choose_superseded
-from rse_pf.storage.charges import charge_name, sum_charges
 from rse_pf.storage.object_store import DirectoryStore, ObjectStore, digest_of
+from rse_pf.storage.quotas import charge_name, sum_charges
 from tests.kit.fake_data_service import Service, small_settings
 from tests.kit.sample_maps import make_map
 
