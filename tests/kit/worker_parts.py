@@ -90,8 +90,8 @@ class WorkerParts:
             self.context,
             set(),
             self.handshake,
-            tell=lambda **message: self.told.append(message),
-            recorder=AuditRecorder(self.clocks, loop=self.loop, tell=self.told.append, is_on=False),
+            send=lambda **message: self.told.append(message),
+            recorder=AuditRecorder(self.clocks, loop=self.loop, send=self.told.append, is_on=False),
         )
         updates = None if live_maps is None else live_maps(self.context, self.answers)
         limited = (

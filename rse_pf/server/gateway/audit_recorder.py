@@ -37,7 +37,7 @@ class AuditRecorder:
         clocks: Clocks,
         *,
         loop: AbstractEventLoop,
-        tell: Callable[..., None],
+        send: Callable[..., None],
         is_on: bool = True,
         refusals: RefusalLimiter | None = None,
     ) -> None:
@@ -46,13 +46,13 @@ class AuditRecorder:
         Args:
             clocks: Monotonic for the rate, wall for the entries.
             loop: For the time of the next batch.
-            tell: Sends a message to the supervisor.
+            send: Sends a message to the supervisor.
             is_on: Whether anything is recorded.
             refusals: Limits how many refusals are recorded one by one; None means the default limits.
         """
         self._clocks = clocks
         self._loop = loop
-        self._tell = tell
+        self._send_message = send
         self._is_on = is_on
         self._refusals = refusals or RefusalLimiter()
         self._held: list[dict[str, Any]] = []
@@ -115,7 +115,7 @@ class AuditRecorder:
         self._next = None
         held, self._held = self._held, []
         for first in range(0, len(held), _MAX_NOTES):
-            self._tell(event="audit", notes=held[first : first + _MAX_NOTES])
+            self._send_message(event="audit", notes=held[first : first + _MAX_NOTES])
 
 
 class ServerAudit:

@@ -95,8 +95,7 @@ class RobotConnection:
 
     @property
     def is_synthetic(self) -> bool:
-        """Whether the robot belongs to the platform, such as the canary, so that it does not count as
-        load."""
+        """Whether the robot belongs to the platform, such as the canary, and does not count as load."""
         return self.claims is not None and SYNTHETIC in self.claims.scopes
 
     @property
@@ -111,7 +110,7 @@ class RobotConnection:
 
     @property
     def may_move(self) -> bool:
-        """Whether the robot said Hello and can be asked to leave for another server."""
+        """Whether the robot said Hello and can be asked to move to another server."""
         return self.session is not None and self.session.state == "open" and not self._assembler.closed
 
     def receive_frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
@@ -166,7 +165,7 @@ class RobotConnection:
             self.write(self.session.refuse_updates(identity, error).data)
 
     def move(self, reason: str, within_ms: float, now: float) -> None:
-        """Ask the robot to leave for another server."""
+        """Ask the robot to move to another server within *within_ms*."""
         if self.session is not None:
             self.moving_until_s = now + within_ms / 1e3
             for message in self.session.move(reason, within_ms):

@@ -28,7 +28,7 @@ class TokenWatch:
         connections: set[RobotConnection],
         handshake: HandshakePolicy,
         *,
-        tell: Callable[..., None],
+        send: Callable[..., None],
         recorder: AuditRecorder,
     ) -> None:
         """Watch *connections*.
@@ -37,13 +37,13 @@ class TokenWatch:
             context: The clocks, event loop, log and metrics of the worker.
             connections: The live connections of this worker; the dispatcher adds and removes them.
             handshake: Verifies fresh tokens, and gets new keys.
-            tell: Sends an event to the supervisor.
+            send: Sends an event to the supervisor.
             recorder: Records fresh tokens, and connections that are closed, for the audit log.
         """
         self.connections = connections
         self._handshake = handshake
         self._context = context
-        self._tell = tell
+        self._send_event = send
         self._recorder = recorder
         self._by_number: dict[int, RobotConnection] = {}
         self._timers: dict[RobotConnection, TimerHandle] = {}
@@ -84,7 +84,7 @@ class TokenWatch:
     def forget(self, connection: RobotConnection) -> None:
         """Forget a connection."""
         self._end_at(connection, None)
-        self._end_stay(connection)
+        _cancel(self._stays, connection)
         if self._by_number.pop(connection.number, None) is not None:
             self._report("left", connection)
 
@@ -104,8 +104,7 @@ class TokenWatch:
         connection.close(CLOSE_REPLACED, "replaced")
 
     def renew(self, connection: RobotConnection, token: str) -> None:
-        """Verify a fresh token of a live connection; if it is valid, the connection lasts until it
-        expires."""
+        """Verify a fresh token of a live connection, which then lasts until that token expires."""
         before, clocks = connection.claims, self._context.clocks
         now, wall_s = clocks.monotonic(), clocks.wall()
         claims = self._handshake.claims_or_problem(token, wall_s)
@@ -124,24 +123,17 @@ class TokenWatch:
         connection.answer_renewal(token_s)
 
     def _end_at(self, connection: RobotConnection, expires_s: float | None) -> None:
-        timer = self._timers.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
+        _cancel(self._timers, connection)
         if expires_s is not None:
             left_s = max(0.0, expires_s - self._context.clocks.monotonic())
             self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
 
     def _stay(self, connection: RobotConnection, left_s: float) -> None:
         """Report to the supervisor after *left_s* that a connection which was asked to move has not left."""
-        self._end_stay(connection)
+        _cancel(self._stays, connection)
         self._stays[connection] = self._context.loop.call_later(
             left_s, partial(self._report, "stays", connection)
         )
-
-    def _end_stay(self, connection: RobotConnection) -> None:
-        timer = self._stays.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
 
     def _revoke(self, connection: RobotConnection, claims: Claims, problem: str) -> None:
         if not connection.is_closing:
@@ -156,4 +148,11 @@ class TokenWatch:
     def _report(self, event: str, connection: RobotConnection) -> None:
         claims = connection.claims
         if claims is not None and (event == "left" or connection in self.connections):
-            self._tell(event=event, robot=claims.robot, number=connection.number)
+            self._send_event(event=event, robot=claims.robot, number=connection.number)
+
+
+def _cancel(timers: dict[RobotConnection, TimerHandle], connection: RobotConnection) -> None:
+    """Cancel and remove the timer of *connection*, if it has one."""
+    timer = timers.pop(connection, None)
+    if timer is not None:
+        timer.cancel()

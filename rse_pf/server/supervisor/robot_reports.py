@@ -22,10 +22,10 @@ _MAX_EVENTS = 500  # in one message, so that it stays below the 1 MiB that a lin
 class RobotEvents:
     """The events of the robots of one worker that wait to be sent."""
 
-    def __init__(self, loop: AbstractEventLoop, say: Callable[..., None]) -> None:
-        """Hold no event yet; *say* sends a message to the supervisor."""
+    def __init__(self, loop: AbstractEventLoop, send: Callable[..., None]) -> None:
+        """Hold no event yet; *send* sends a message to the supervisor."""
         self._loop = loop
-        self._say = say
+        self._send = send
         self._held: list[dict[str, Any]] = []
 
     def add(self, **event: Any) -> None:
@@ -38,7 +38,7 @@ class RobotEvents:
         """Send the waiting events now."""
         held, self._held = self._held, []
         for first in range(0, len(held), _MAX_EVENTS):
-            self._say(event="robots", robots=held[first : first + _MAX_EVENTS])
+            self._send(event="robots", robots=held[first : first + _MAX_EVENTS])
 
 
 def robot_rows(connections: Iterable[RobotConnection], now: float) -> list[dict[str, Any]]:

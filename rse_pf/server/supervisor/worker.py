@@ -181,7 +181,7 @@ class _Worker:
         self._loop = loop
         self._ended = 0
         self._flushing = False
-        self._robot_events = RobotEvents(loop, self._say)
+        self._robot_events = RobotEvents(loop, self._send)
         self._tasks: set[asyncio.Task[None]] = set()
         self._log = log
         registry = load_services(plan.services, settings)
@@ -207,12 +207,12 @@ class _Worker:
             objects=ObjectRefs(store, settings.data),
         )
         handshake = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
-        self._recorder = AuditRecorder(context.clocks, loop=loop, tell=self._say, is_on=plan.audit)
+        self._recorder = AuditRecorder(context.clocks, loop=loop, send=self._send, is_on=plan.audit)
         self._token_watch = TokenWatch(
             context,
             connections,
             handshake,
-            tell=self._robot_events.add,
+            send=self._robot_events.add,
             recorder=self._recorder,
         )
         self._sandboxes = (
@@ -344,7 +344,7 @@ class _Worker:
         self._dispatcher.start()
         gc.collect()
         gc.freeze()
-        self._say(event="ready")
+        self._send(event="ready")
         while line := await reader.readline():
             order = decode_order(line)
             self._obey(order)
@@ -360,7 +360,7 @@ class _Worker:
     def _obey(self, order: WorkerOrder) -> None:
         match order:
             case ReportOrder():
-                self._say(event="report", report=self._report())
+                self._send(event="report", report=self._report())
             case DrainOrder():
                 self._dispatcher.move_all("drain", order.within_ms)
                 self._keep(self._report_when_empty())
@@ -399,12 +399,12 @@ class _Worker:
         self._send_rows(number, len(blocks), [asdict(block) for block in blocks[:_MAX_BLOCKS]])
 
     def _send_rows(self, number: int, count: int, rows: list[dict[str, Any]]) -> None:
-        self._say(event="rows", number=number, count=count, rows=rows)
+        self._send(event="rows", number=number, count=count, rows=rows)
 
     async def _report_when_empty(self) -> None:
         while self._dispatcher.connections:
             await asyncio.sleep(_POLL_S)
-        self._say(event="empty")
+        self._send(event="empty")
 
     async def _leave(self, held_s: float) -> None:
         until = time.monotonic() + held_s
@@ -458,7 +458,7 @@ class _Worker:
         self._named += 1
         return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
 
-    def _say(self, **message: Any) -> None:
+    def _send(self, **message: Any) -> None:
         self._writer.write(msgspec.json.encode(message) + b"\n")
 
     def _keep(self, work: Any) -> None:

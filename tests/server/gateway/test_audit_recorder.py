@@ -29,7 +29,7 @@ class Recording:
         self.told: list[dict[str, Any]] = []
         self.loop = FakeLoop(0.0)
         clocks = Clocks(monotonic=self.loop.time, wall=lambda: 1e9 + self.loop.now, cpu=lambda: 0.0)
-        self.recorder = AuditRecorder(clocks, refusals=refusals, loop=self.loop, tell=self._tell, is_on=is_on)
+        self.recorder = AuditRecorder(clocks, refusals=refusals, loop=self.loop, send=self._tell, is_on=is_on)
 
     @property
     def notes(self) -> list[dict[str, Any]]:

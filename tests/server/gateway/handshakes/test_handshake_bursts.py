@@ -25,7 +25,7 @@ class Burst:
         self.parts = WorkerParts(stack.enter_context(quiet_log()), settings=settings)
         self.ended: list[int] = []
         self.loop = self.parts.loop
-        recorder = AuditRecorder(self.parts.clocks, loop=self.loop, tell=print, is_on=False)
+        recorder = AuditRecorder(self.parts.clocks, loop=self.loop, send=print, is_on=False)
         self.sockets = RobotSockets(
             self.parts.dispatcher, self.parts.handshake, max_robots=count, workers=1,
             new_name=lambda: "r", recorder=recorder,
