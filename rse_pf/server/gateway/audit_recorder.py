@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import time
 from asyncio import AbstractEventLoop, TimerHandle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rse_pf.audit.entry import Entry, RefusalLimiter, Value
 from rse_pf.audit.log import SYNC_S, AuditLog
@@ -25,8 +25,6 @@ __all__ = ["AuditRecorder", "ServerAudit"]
 _MAX_NOTES = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
 _SUM_UP_S = 10.0  # counted refusals are written as one entry this often
 _UNAUTHORIZED = 401
-
-_W = TypeVar("_W")
 
 
 class AuditRecorder:
@@ -134,21 +132,10 @@ class ServerAudit:
         if self._log is not None:
             self._log.record(action, **detail)
 
-    def message_handler(
-        self, otherwise: Callable[[_W, dict[str, Any]], None]
-    ) -> Callable[[_W, dict[str, Any]], None]:
-        """Return the function that handles the messages of workers.
-
-        It records the notes in them, and passes every other message to *otherwise*.
-        """
-
-        def handle(worker: _W, message: dict[str, Any]) -> None:
-            if message["event"] != "audit":
-                otherwise(worker, message)
-            elif self._log is not None:
-                self._log.add(Entry(actor=self._log.who, **note) for note in message["notes"])
-
-        return handle
+    def add(self, notes: Iterable[dict[str, Any]]) -> None:
+        """Record the *notes* that a worker sent."""
+        if self._log is not None:
+            self._log.add(Entry(actor=self._log.who, **note) for note in notes)
 
     def __enter__(self) -> ServerAudit:
         if self._log is not None:

@@ -221,7 +221,6 @@ class _Supervisor:
         self._log = log
         self._workers = processes.workers
         self._registry = SessionRegistry()
-        self._on_robot = records.message_handler(self._registry.handle)
         self._crashes = CrashRecovery(
             self._workers, processes.spares, registry=self._registry, trust=self._trust, log=self._log,
             records=records,
@@ -250,7 +249,7 @@ class _Supervisor:
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
         readiness = [
-            loop.create_task(worker.connect(on_lost=self._on_lost, on_robot=self._on_robot))
+            loop.create_task(worker.connect(on_lost=self._on_lost, on_message=self._on_message))
             for worker in self._workers
         ]
         everything = asyncio.gather(*readiness)
@@ -295,6 +294,13 @@ class _Supervisor:
                 return
         self._refused_full += 1
 
+    def _on_message(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
+        """Handle what a worker reports: notes for the audit log, or an event of one robot."""
+        if message["event"] == "audit":
+            self._records.add(message["notes"])
+        else:
+            self._registry.handle(worker, message)
+
     # --- the end -------------------------------------------------------------------------------
 
     def _on_lost(self, worker: WorkerProcess) -> None:
@@ -309,7 +315,7 @@ class _Supervisor:
             self._finish(_EXIT_LOST)
 
     async def _succeed(self, heir: WorkerProcess) -> None:
-        await heir.connect(on_lost=self._on_lost, on_robot=self._on_robot)
+        await heir.connect(on_lost=self._on_lost, on_message=self._on_message)
         if self._state == "draining":
             heir.order(DrainOrder(MOVE_WITHIN_MS))
         elif self._state == "leaving":

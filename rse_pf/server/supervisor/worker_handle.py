@@ -151,10 +151,15 @@ class WorkerProcess:
         self,
         *,
         on_lost: Callable[[WorkerProcess], None],
-        on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
+        on_message: Callable[[WorkerProcess, dict[str, Any]], None],
     ) -> None:
-        """Wait until the worker takes sockets; *on_lost* is called if it ends, before that or later."""
-        self._on_lost, self._on_robot = on_lost, on_robot
+        """Wait until the worker takes sockets.
+
+        Args:
+            on_lost: Called if the worker ends, before that or later.
+            on_message: Called with each event of a robot, and with notes for the audit log.
+        """
+        self._on_lost, self._on_message = on_lost, on_message
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
         loop = asyncio.get_running_loop()
         ready = asyncio.Event()
@@ -218,31 +223,32 @@ class WorkerProcess:
     async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
         try:
             while line := await reader.readline():
-                self._on_message(msgspec.json.decode(line), ready)
+                self._handle(msgspec.json.decode(line), ready)
         except OSError:
             pass  # a killed worker resets its channel: the same end as below
         self.gone.set()
         self.empty.set()
         self._on_lost(self)
 
-    def _on_message(self, message: dict[str, Any], ready: asyncio.Event) -> None:
-        if message["event"] == "ready":
-            ready.set()
-        elif message["event"] == "empty":
-            self.empty.set()
-        elif message["event"] == "rows":
-            waiting = self._rows
-            if waiting is not None and not waiting.done() and message["number"] == self._rows_number:
-                waiting.set_result(message)
-        elif message["event"] == "robots":
-            for event in message["robots"]:
-                self._on_robot(self, event)
-        elif message["event"] != "report":
-            self._on_robot(self, message)
-        else:
-            self.report = message["report"]
-            if self._reported is not None and not self._reported.done():
-                self._reported.set_result(None)
+    def _handle(self, message: dict[str, Any], ready: asyncio.Event) -> None:
+        match message["event"]:
+            case "ready":
+                ready.set()
+            case "empty":
+                self.empty.set()
+            case "rows":
+                waiting = self._rows
+                if waiting is not None and not waiting.done() and message["number"] == self._rows_number:
+                    waiting.set_result(message)
+            case "robots":
+                for event in message["robots"]:
+                    self._on_message(self, event)
+            case "report":
+                self.report = message["report"]
+                if self._reported is not None and not self._reported.done():
+                    self._reported.set_result(None)
+            case _:
+                self._on_message(self, message)
 
     def _count_ended(self) -> None:
         try:
