@@ -143,9 +143,7 @@ def _run(words: list[str]) -> int:
         return _EXIT_OK
     name, *rest = words
     if name.startswith("-"):
-        raise UsageError(
-            f"{name} stands before the verb", hint="write rse-pf VERB OPTIONS; see rse-pf --help"
-        )
+        raise UsageError(f"{name} comes before the verb", hint="write rse-pf VERB OPTIONS; see rse-pf --help")
     if name not in VERBS:
         raise UsageError(f"there is no verb {name!r}", hint=did_you_mean(name, VERBS))
     try:

@@ -162,7 +162,8 @@ def map_name(name: str | None, out: Path) -> str:
         return _NO_NAME.sub("-", out.absolute().name.lower()).strip("-")[:64].strip("-") or "drive"
     if not _MAP_NAME.fullmatch(name):
         raise UsageError(
-            f"{name[:80]!r} is no name of a map", hint="use 1 to 64 small letters, digits and hyphens"
+            f"{name[:80]!r} is not a valid name of a map",
+            hint="use 1 to 64 small letters, digits and hyphens",
         )
     return name
 

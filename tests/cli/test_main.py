@@ -42,7 +42,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("lcoal", "no verb 'lcoal'", "did you mean local?"),
         ("xyzzy", "no verb 'xyzzy'", "known are demo, check, compare"),
-        ("--settings a.json serve", "--settings stands before the verb", "rse-pf VERB OPTIONS"),
+        ("--settings a.json serve", "--settings comes before the verb", "rse-pf VERB OPTIONS"),
         ("serve --prot 1", "unknown option --prot", "did you mean --port?"),
         ("serve --prot=1", "unknown option --prot", "did you mean --port?"),
         ("serve --port one", "argument --port: invalid int value: 'one'", "rse-pf serve --help"),
@@ -54,7 +54,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("serve --keys .", "cannot read the keys .: Is a directory", "JWKS"),
         ("serve --keys empty", "this is not a key set", "check empty"),
         ("serve --announce none/a.json", "there is no folder", "--announce"),
-        ("serve --server-id ", "'' is no name for a server", "1 to 64"),
+        ("serve --server-id ", "'' is not a valid name of a server", "1 to 64"),
         ("serve", "there are no keys", "key set file"),
         ("serve --settings none.json", "cannot read none.json", "--settings"),
         ("serve --settings empty", "empty is not JSON", "correct the file"),

@@ -88,7 +88,9 @@ def enrolment_lines(made: Enrolment, file: Path) -> list[str]:
     if is_loopback(host):
         lines.append("only this machine reaches that address; rse-pf local --lan opens one to others")
     elif made.url.startswith("ws:"):
-        lines.append("tokens and data cross the network in clear text: the address is no wss://")
+        lines.append(
+            "tokens and data cross the network in clear text: the address does not begin with wss://"
+        )
     elif not made.authority:
         lines.append(
             "the robot trusts the authorities of its machine; for a certificate of a private one enrol "
@@ -113,7 +115,7 @@ def _place(request: EnrolRequest) -> tuple[str, Path | None]:
         )
     parts = urlsplit(url)
     if parts.scheme not in ("ws", "wss") or not parts.hostname:
-        raise UsageError(f"{url[:200]!r} is no address of a platform", hint="write wss://HOST:PORT/ws")
+        raise UsageError(f"{url[:200]!r} is not the address of a platform", hint="write wss://HOST:PORT/ws")
     if authority is None and not request.url and state is not None and state.authority_file:
         authority = Path(state.authority_file)
     return url, authority

@@ -89,7 +89,7 @@ def confirmed(request: ChangeRequest, question: str = "go on?") -> bool:
     if request.yes:
         return True
     if not sys.stdin.isatty():
-        raise UsageError("nobody can be asked here", hint="read the plan above, then add --yes")
+        raise UsageError("nobody can confirm this here", hint="read the plan above, then add --yes")
     show(f"{question} [y/N]")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

@@ -70,7 +70,7 @@ def _confirmed_twice(request: DownRequest, names: ResourceNames) -> bool:
             )
         return True
     if not sys.stdin.isatty():
-        raise UsageError("nobody can be asked a second time here", hint=f"add --confirm {names.prefix}")
+        raise UsageError("nobody can confirm this a second time here", hint=f"add --confirm {names.prefix}")
     show(
         "maps and logs cannot be brought back, and the signing key only within 30 days; "
         f"type {names.prefix} to delete them"

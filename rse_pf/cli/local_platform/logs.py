@@ -107,7 +107,7 @@ def since_time_s(text: str, now_s: float) -> float:
         return datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):
         raise UsageError(
-            f"--since {text[:40]!r} is no age and no time",
+            f"--since {text[:40]!r} is neither an age nor a time",
             hint='write an age such as 90s, 5m, 2h or 1d, or a time such as "2026-03-01 14:30:00"',
         ) from None
 

@@ -180,8 +180,9 @@ def _read(request: MapRequest, settings: PlatformSettings) -> dict[str, Any]:
     except NotFound:
         lease = None
     if lease is None or lease.state == "stopped":
-        why = "there is no" if lease is None else "somebody stopped the"
-        raise NotFound(f"{why} live map {request.name!r}", hint="see rse-pf map live list")
+        live_map = f"live map {request.name!r}"
+        why = f"there is no {live_map}" if lease is None else f"{live_map} was stopped"
+        raise NotFound(why, hint="see rse-pf map live list")
     log = LiveLog(store, map_folder(request.tenant, request.name), owner="", epoch=0, base=lease.base)
     state = restore(log, LIVE_MAP)
     return show_reply(

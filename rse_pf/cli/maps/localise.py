@@ -167,7 +167,7 @@ def _photo(path: Path) -> bytes:
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}", hint="name a JPEG or PNG file") from error
     except ValueError as error:
-        raise UsageError(f"{path} is no photo", hint="name a JPEG or PNG file") from error
+        raise UsageError(f"{path} is not a photo", hint="name a JPEG or PNG file") from error
 
 
 def _client(request: LocaliseRequest) -> DataClient:
@@ -188,7 +188,9 @@ def _client(request: LocaliseRequest) -> DataClient:
         try:
             trusted = ssl.create_default_context(cafile=str(request.authority))
         except OSError as error:
-            raise UsageError(f"{request.authority} is no certificate", hint="name authority.crt") from error
+            raise UsageError(
+                f"{request.authority} is not a certificate", hint="name authority.crt"
+            ) from error
     return DataClient(request.url, token, DataOptions(ssl_context=trusted))
 
 

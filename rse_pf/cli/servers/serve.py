@@ -128,7 +128,9 @@ def run_server(request: ServeRequest, settings: PlatformSettings) -> int:
     placement = ServerPlacement.read(request.settings, chosen, **_given(request, _PLACEMENT))
     server_id = f"server-{os.getpid()}" if request.server_id is None else request.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
-        raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")
+        raise UsageError(
+            f"{server_id[:80]!r} is not a valid name of a server", hint="use 1 to 64 printable letters"
+        )
     token = None if request.control_token is None else read_control_token(request.control_token)
     if request.announce is not None and not request.announce.absolute().parent.is_dir():
         raise UsageError(

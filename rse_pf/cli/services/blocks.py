@@ -101,7 +101,7 @@ def choose_servers(request: ServersRequest) -> list[Server]:
     named = request.control_port if request.url is None else _port_of(request.url)
     if named is not None:
         if not 0 < named < 65536:
-            raise UsageError(f"{named} is no port", hint="name a port from 1 to 65535")
+            raise UsageError(f"{named} is not a port", hint="name a port from 1 to 65535")
         token = None if request.control_token is None else read_control_token(request.control_token)
         return [(f"port {named}", named, token)]
     state = read_state(state_folder(request.name, os.environ))
@@ -123,7 +123,7 @@ def _port_of(url: str) -> int:
         host, port = None, None
     if host not in _LOOPBACK or port is None or parts.scheme != "http":
         raise UsageError(
-            f"{url[:80]!r} is no control port of this machine",
+            f"{url[:80]!r} is not a control port of this machine",
             hint="write --url http://127.0.0.1:PORT, on the machine of the server",
         )
     return port

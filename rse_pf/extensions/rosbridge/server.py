@@ -125,7 +125,7 @@ def serve_rosbridge(
     if not 0 <= port < 65536:
         raise UsageError(f"{port} is not a port", hint="name one from 1 to 65535, or 0 for a free one")
     if urlsplit(url).scheme not in ("ws", "wss") or not urlsplit(url).hostname:
-        raise UsageError(f"{url[:80]!r} is no address of a platform", hint="write ws://HOST:PORT/ws")
+        raise UsageError(f"{url[:80]!r} is not the address of a platform", hint="write ws://HOST:PORT/ws")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         listening = socket.create_server((host, port), family=family, backlog=BACKLOG)

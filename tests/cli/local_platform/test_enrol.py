@@ -63,7 +63,7 @@ def test_the_file_holds_address_authority_and_the_key_that_the_roster_knows(
     ("words", "said"),
     [
         ("robot-1 --out r1", "platform 'default' does not run"),
-        ("robot-1 --out r1 --url 10.1.2.3", "is no address of a platform"),
+        ("robot-1 --out r1 --url 10.1.2.3", "is not the address of a platform"),
         ("robot-1 --out r1 --url wss://a/ws --authority missing", "cannot read the authority"),
         ("robot-1 --out r1 --url wss://a/ws --authority secret.pem", "is not the certificate"),
         ("robot-1 --out there --url wss://a/ws", "exists already"),

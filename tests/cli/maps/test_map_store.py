@@ -166,7 +166,7 @@ def test_a_wrong_name_of_a_map_is_refused_before_the_drive(
     assert main(["map", "from-bag", "drive.bag", "--map", name, *PLATFORM]) == 2
 
     error = capsys.readouterr().err
-    assert "is no name of a map" in error
+    assert "is not a valid name of a map" in error
     assert len(error.splitlines()) == 2
 
 

@@ -10,8 +10,8 @@ from rse_pf.cli.main import main
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (("--url", "platform.example"), "is no address of a platform"),
-        (("--url", "http://127.0.0.1/ws"), "is no address of a platform"),
+        (("--url", "platform.example"), "is not the address of a platform"),
+        (("--url", "http://127.0.0.1/ws"), "is not the address of a platform"),
         (("--port", "70000"), "70000 is not a port"),
         (("--announce", "/nowhere/at/all"), "there is no folder /nowhere/at"),
     ],

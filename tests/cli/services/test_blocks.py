@@ -172,4 +172,4 @@ def test_a_server_without_a_platform_is_asked_at_its_port_with_its_token(capsys,
     told(capsys, "status", "--control-port", port, "--control-token", str(token))
 
     assert ports[0].asked == [f"GET /blocks Bearer {TOKEN}"]
-    assert "is no port" in told(capsys, "status", "--control-port", "0", code=2)
+    assert "is not a port" in told(capsys, "status", "--control-port", "0", code=2)

@@ -308,7 +308,7 @@ def test_pause_for_a_moment_stops_the_tree_and_lets_it_go_on(terminal: Terminal)
     told = terminal.run("local", "pause", "server-1", "--for", "0.2")
 
     assert told.returncode == 0
-    assert told.stdout.splitlines()[1] == "server-1 goes on"
+    assert told.stdout.splitlines()[1] == "server-1 continues"
     assert is_alive(state.servers[0].process)
     table = terminal.run("local", "status").stdout
     assert table.splitlines()[0].split()[:4] == ["server", "pid", "state", "robots"]

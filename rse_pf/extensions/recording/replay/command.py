@@ -81,7 +81,7 @@ def _check(request: ReplayRequest) -> None:
         raise UsageError("--command is one command, and --all is all of them", hint="leave one of them out")
     if request.command is not None and not _IDENTITY.fullmatch(request.command):
         raise UsageError(
-            f"{request.command[:60]!r} is no command",
+            f"{request.command[:60]!r} is not the id of a command",
             hint="write CONNECTION:ID, as rse-pf replay FILE lists them",
         )
     page = request.html
@@ -97,7 +97,9 @@ def _overrides(request: ReplayRequest) -> Overrides:
     from rse_pf.extensions.recording.replay.solving import Overrides
 
     if request.inlier_px is not None and not math.isfinite(request.inlier_px):
-        raise UsageError(f"--inlier-px {request.inlier_px} is no number of pixels", hint="try 2, 4, 8 or 16")
+        raise UsageError(
+            f"--inlier-px {request.inlier_px} is not a number of pixels", hint="try 2, 4, 8 or 16"
+        )
     chosen = Overrides(
         engine=request.engine, inlier_px=request.inlier_px, max_iterations=request.max_iterations
     )
