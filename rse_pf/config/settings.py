@@ -1,7 +1,7 @@
 """Every port, path and threshold of the platform as one table: default, unit, range, source and help.
 
 ``context."rse-pf"`` of ``cdk.json`` holds overrides only.  Numbers that no operator changes are constants
-beside their use.  Nothing here reads a file or the environment.
+where they are used.  Nothing here reads a file or the environment.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ __all__ = [
 
 
 LIVE_PORTS = 64
-"""Ports from ``live.first_port`` on, which the firewall opens between servers: one for each owner of a live map."""
+"""Ports from ``live.first_port`` on, which the firewall opens between servers: one for each map server."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,29 +65,28 @@ class ServingSettings:
     control_host: str = setting("127.0.0.1", doc="address of the control port")
     control_port: int = setting(8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535)
     rosbridge: bool = setting(False, doc="also serve rosbridge v2 clients, on the path /rosbridge")
-    workers: int = setting(0, doc="worker processes of a server; 0 means one per core, and one where rse-pf local runs several servers on a machine", low=0, high=256)
+    workers: int = setting(0, doc="worker processes of a server; 0: one per core, or one if rse-pf local runs several servers on a machine", low=0, high=256)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
     max_unauthenticated: int = setting(200, unit="sockets", doc="sockets without a verified token; the oldest one is closed when a new one exceeds the limit", low=1)
-    max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
-    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets that have begun to send and are passed to a worker each second; more wait; 0 is off", low=0)
+    max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="sockets of one source address without a verified token; not counted behind trusted proxies; 0 is off", low=0)
+    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="new sockets that are passed to workers each second; more wait; 0 is off", low=0)
     max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
     trusted_proxies: int = setting(1, unit="proxies", doc="proxies between robots and servers that append to x-forwarded-for, the load balancer of the platform included: 1, or 2 behind a proxy of your own; 0: robots connect to the servers directly", low=0, high=8)
     allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
-    slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
+    slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a robot that does not read its answers for this long is disconnected", low=0.05)
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
-    max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; the process of one that needs more is ended", low=67108864)
-    max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
+    max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; its process is killed above this", low=67108864)
+    max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; its process is killed above this", low=0.1)
     max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 turns long services off", low=0, high=64)
-    max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
-    job_lease_s: float = setting(5.0, unit="s", doc="after this time without a renewal, a job begins anew on the server where its robot asks", low=0.1)
-    max_job_s: float = setting(3600.0, unit="s", doc="a job that runs longer is ended; waiting has no limit", low=1)
+    max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; it is killed above this", low=134217728)
+    job_lease_s: float = setting(5.0, unit="s", doc="a job whose lease was not renewed for this long is started again on another server when its robot asks", low=0.1)
     drain_wait_s: float = setting(1.0, unit="s", doc="a draining server reports not ready for this long before it moves its robots", low=0)
     log_level: str = setting("info", doc="least level of the lines that are logged", choices=("debug", "info", "warning", "error"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionSettings:
-    """What a robot and a server agree on: limits, pings, reconnects."""
+    """The protocol between a robot and a server: limits, pings, reconnects."""
 
     max_message_bytes: int = setting(262144, unit="bytes", doc="one WebSocket message on the wire", low=1024)
     max_inflated_bytes: int = setting(1048576, unit="bytes", doc="one message after inflating", low=1024)
@@ -142,7 +141,7 @@ class ScalingSettings:
 class DataSettings:
     """Data servers: images, keyframes, clouds and maps."""
 
-    enabled: bool = setting(True, doc="run the data service beside each backend server on AWS, and keep objects and maps in the map bucket; without it servers there share no objects, maps or jobs, and have no live maps")
+    enabled: bool = setting(True, doc="run the data service on each backend server on AWS, and keep objects and maps in the map bucket; without it servers there share no objects, maps or jobs, and have no live maps")
     store: str = setting("memory:", doc="object store: dir:PATH, s3:BUCKET or memory:")
     port: int = setting(8767, doc="port of the data service; 0 takes a free one", low=0, high=65535)
     host: str = setting("127.0.0.1", doc="address the data service listens on")
@@ -170,34 +169,34 @@ class ServiceSettings:
     """Services that the operator installs; each robot has a sandbox of its own."""
 
     folder: str = setting("", doc="folder of installed services; empty means none")
-    follow: bool = setting(False, doc="the services folder is a link that changes while the server runs: load it anew when the control port is told to, and serve without what cannot be loaded")
+    follow: bool = setting(False, doc="the services folder is a link that may change while the server runs: load it again at POST /services of the control port, and leave out services that cannot be loaded")
     published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
     max_sandboxes: int = setting(64, doc="sandboxes of one server", low=1)
     memory_bytes: int = setting(536870912, unit="bytes", doc="memory of one sandbox: its address space and its scratch folder of 16 MiB together", low=16777216)
-    grace_s: float = setting(5.0, unit="s", doc="a sandbox outlives the connection of its robot by this", low=0)
-    breaker_crashes: int = setting(5, unit="crashes", doc="this many crashes of a service within 30 s open its circuit breaker", low=2)
+    grace_s: float = setting(5.0, unit="s", doc="a sandbox is kept for this long after the connection of its robot ended", low=0)
+    breaker_crashes: int = setting(5, unit="crashes", doc="crashes of a service within 30 s that open its circuit breaker", low=2)
     accept_weak_isolation: bool = setting(False, doc="run installed services even if the kernel lacks a means of isolation")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveSettings:
-    """Maps that robots make together while they drive; each has an owner process on one server."""
+    """Maps that robots build together while they drive; each has a map server, a process of one backend server."""
 
-    host: str = setting("127.0.0.1", doc="address on which owners of live maps listen for the other servers; 0.0.0.0 listens on all and tells the main one")
-    first_port: int = setting(8800, doc="first of the 64 ports of owners of live maps; on loopback, and with 0, any free one is taken", low=0, high=65535 - 63)
-    max_owners: int = setting(4, doc="owner processes of one worker; further maps are refused until another server takes them; 0 switches live maps off", low=0, high=64)
-    warm_standby: bool = setting(True, doc="keep one started process, about 70 MB, in each worker whose robots use live maps; it takes a map over a second sooner")
+    host: str = setting("127.0.0.1", doc="address on which map servers listen for other backend servers; 0.0.0.0 listens on all addresses and announces the main one")
+    first_port: int = setting(8800, doc="first of the 64 ports of map servers; on loopback, and with 0, any free port is taken", low=0, high=65535 - 63)
+    max_owners: int = setting(4, doc="map servers of one worker; more maps are refused until another backend server takes them; 0 switches live maps off", low=0, high=64)
+    warm_standby: bool = setting(True, doc="keep one started process, about 70 MB, in each worker whose robots use live maps; a takeover is then a second shorter")
     lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
-    publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
-    keep_versions: int = setting(20, unit="versions", doc="newest versions of a live map that stay, of those that nobody asked for; older ones are removed, and those above a quarter of the tenant's quota; 0 keeps all", low=0)
-    idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
+    publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two published versions of a live map; an earlier request waits", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
+    keep_versions: int = setting(20, unit="versions", doc="automatic versions of a live map that are kept, at most a quarter of the tenant's quota; older ones are removed; 0 keeps all", low=0)
+    idle_s: float = setting(60.0, unit="s", doc="a map server publishes its map and exits when no robot used the map for this long", low=1)
     images: bool = setting(False, doc="robots store the image of each keyframe of a live map, about 60 kB each, for exports of its versions")
-    keep_log: bool = setting(False, doc="keep all entries of a live map's log, which experiments replay; else those before the older snapshot are deleted")
+    keep_log: bool = setting(False, doc="keep the whole log of a live map, for replays in experiments; otherwise entries before the older snapshot are deleted")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingSettings:
-    """What robots and servers said, kept in files that rse-pf replay reads."""
+    """Recordings of the messages of robots and servers, which rse-pf replay reads."""
 
     folder: str = setting("", doc="folder of recordings; empty: nothing is recorded")
     max_bytes: int = setting(4294967296, unit="bytes", doc="size of all recordings of the folder above which the oldest files are deleted", low=1048576)
@@ -207,7 +206,7 @@ class RecordingSettings:
 class BatchSettings:
     """Merges that are computed in parts: rse-pf batch."""
 
-    pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part; what a killed worker loses", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
+    pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part, which is repeated if its worker is killed", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,6 +46,7 @@ from rse_pf.storage.quotas import Accounts
 
 __all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
 
+MAX_JOB_S = 3600.0  # a job that runs longer is killed: the largest merge that is accepted takes an hour
 _POLL_SHARE = 0.5  # of the time between two renewals: a follower reads the record this often
 _KILL_AFTER_S = 0.6  # a cancelled job has this long to exit before it is killed
 _READ_BYTES = 1 << 18
@@ -238,9 +239,8 @@ class _JobRun:
         if why == "cancelled":
             return self._store_failure(_cancelled_error())
         if why == "late":
-            max_s = self._context.settings.serving.max_job_s
             return self._store_failure(
-                Expired(f"the job took longer than {max_s:g} s", hint="send less at once")
+                Expired(f"the job took longer than {MAX_JOB_S:g} s", hint="send less at once")
             )
         if self._end is None:
             return self._store_failure(_crash_error(exit_code))
@@ -266,7 +266,7 @@ class _JobRun:
                 killed_s = now + _KILL_AFTER_S
             if now >= killed_s:
                 return "cancelled"
-            if now - began >= serving.max_job_s:
+            if now - began >= MAX_JOB_S:
                 return "late"
             if now >= next_heartbeat:
                 next_heartbeat = now + renewal_s(serving.job_lease_s)

@@ -31,8 +31,7 @@ MAX_MAPS = 64
 """Most maps of one request, which is refused with more; all maps together have at most 2,000 keyframes."""
 _MAX_PROJECTIONS = 20_000_000_000
 """Largest product of the numbers of keyframes and of cloud points of all maps of a request, which is refused
-with LimitExceeded beyond it: this number of projections takes an hour, the default time limit of a
-job (``max_job_s``)."""
+with LimitExceeded beyond it: this number of projections takes an hour, the time limit of a job."""
 
 
 class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
