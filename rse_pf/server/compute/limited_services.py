@@ -88,7 +88,7 @@ class LimitedServices:
                 self._note_crash(queued, overrun.message)
             raise Expired(
                 f"its deadline passed after {(context.clocks.monotonic() - now) * 1e3:.0f} ms of work",
-                hint="allow more time, or send a smaller map",
+                hint="set a longer deadline, or send a smaller map",
             ) from None
         except Crashed as crash:
             self._note_crash(queued, crash.message)

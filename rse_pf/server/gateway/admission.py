@@ -25,7 +25,7 @@ from rse_pf.server.scheduling.command_queue import QueueBacklog, QueuedCommand, 
 from rse_pf.server.scheduling.overload import PAUSE_S
 from rse_pf.server.scheduling.scheduler import BEHIND, BEHIND_HINT, behind_error, expired_error
 
-__all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
+__all__ = ["DECODER_FULL", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
 
 MAX_QUEUE_PER_ROBOT = 8  # waiting commands of one robot: as many as it may have unanswered by default
 _MAX_UNREAD_BYTES = 1 << 24  # long messages that may wait for the decoder thread of a worker: 64 of 256 KiB
@@ -43,14 +43,11 @@ class UnreadRefusal(NamedTuple):
     hint: str
 
 
-TOO_FAST = UnreadRefusal(
-    "rate",
-    "this robot sends more than its rate",
-    "send fewer, or have the operator raise session.max_commands_per_s",
-)
 TOO_LATE = UnreadRefusal("unread", BEHIND, BEHIND_HINT)
 DECODER_FULL = UnreadRefusal(
-    "unread", "too many long messages wait to be read", "try again later, or send less at once"
+    "unread",
+    f"more than {_MAX_UNREAD_BYTES} bytes of long messages wait to be decoded",
+    "send the command again after retry_after_ms, or send shorter messages",
 )
 
 
@@ -59,6 +56,11 @@ class Admission:
 
     def __init__(self, session: SessionSettings, *, max_queue: int = MAX_QUEUE_PER_ROBOT) -> None:
         self.rates = RobotRates(session)
+        self.too_fast = UnreadRefusal(
+            "rate",
+            f"this robot sends more than {session.max_commands_per_s:g} messages a second",
+            "send fewer messages, or have the operator raise session.max_commands_per_s",
+        )
         self._max_queue = max_queue
 
     def may_wait(self, size_bytes: int, unread_bytes: int, bad_messages: int) -> bool:
@@ -92,8 +94,8 @@ class Admission:
             return RefusedCommand(queued, expired_error(queued, queued.received_s), "expired")
         if backlog.waiting >= self._max_queue:
             busy = Busy(
-                f"{backlog.waiting} commands of this robot wait already",
-                hint="send slower, or let newer frames replace older ones",
+                f"{backlog.waiting} commands of this robot wait already, and at most {self._max_queue} may",
+                hint="send more slowly, or name a stream, in which newer frames replace older ones",
                 retry_after_ms=1e3 * PAUSE_S,
             )
             return RefusedCommand(queued, busy, "robot-queue")

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rse_pf.errors import Busy, NotFound, ProtocolError, UnknownService
-from rse_pf.server.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
+from rse_pf.server.gateway.admission import DECODER_FULL, TOO_LATE, Admission
 from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.gateway.handshake import Accepted
@@ -220,7 +220,7 @@ class Dispatcher:
             connection.close(CLOSE_RATE, "rate")
             return True
         if retry_ms:
-            answers.refuse_unread(connection, peek(codec, data), len(data), TOO_FAST, retry_ms)
+            answers.refuse_unread(connection, peek(codec, data), len(data), self.admission.too_fast, retry_ms)
             return True
         # 2. The backlog of the server, or the rest of a pause; a robot that ignores pauses is not refused.
         scheduler = self.stateless.scheduler

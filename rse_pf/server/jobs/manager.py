@@ -87,7 +87,7 @@ class JobManager(CommandQueue):
             owner: Name of this worker, unique among the workers of all servers.
         """
         self._context = context
-        self._serving = context.settings.serving
+        self._max_jobs = context.settings.serving.max_running_jobs + MAX_WAITING_JOBS
         self._loop = loop
         self._log = log
         self._answer = answer
@@ -139,7 +139,7 @@ class JobManager(CommandQueue):
                 trace=command.trace,
             )
             if not self._has_capacity(request):
-                self._fail(queued, _too_many_error())
+                self._fail(queued, self._too_many_error())
                 return
             entry = self._entries[name] = _Entry(request, JobSignals())
             self._begin(entry)
@@ -192,7 +192,7 @@ class JobManager(CommandQueue):
         (`largest_holder`).
         """
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
-        if len(here) < self._serving.max_running_jobs + MAX_WAITING_JOBS:
+        if len(here) < self._max_jobs:
             return True
         newest = {entry.request.robot: entry for entry in here if entry.what == WAITING}
         held = Counter(entry.request.robot for entry in here)
@@ -203,7 +203,7 @@ class JobManager(CommandQueue):
         displaced.signals.give_up()
         waiters, displaced.waiters = displaced.waiters, []
         for waiter in waiters:
-            self._fail(waiter.queued, _too_many_error())
+            self._fail(waiter.queued, self._too_many_error())
         return True
 
     def _begin(self, entry: _Entry) -> None:
@@ -217,7 +217,8 @@ class JobManager(CommandQueue):
                 outcome = run_job(entry.request, self._context, entry.signals, report, self._owner)
             except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
                 self._log.error("job-defect", service=entry.request.service, reason=repr(error))
-                outcome = JobOutcome(error=RsePfError("the job failed", hint="the server's log has it"))
+                hint = "see job-defect in the server's log"
+                outcome = JobOutcome(error=RsePfError("the job failed", hint=hint))
             in_loop(self._on_outcome, entry, outcome)
             if not outcome.is_given_up:
                 self._collector.collect()
@@ -289,6 +290,13 @@ class JobManager(CommandQueue):
         for queued in entry.resubmitted:
             self.submit(queued, self._context.clock())
 
+    def _too_many_error(self) -> Busy:
+        return Busy(
+            f"this server has {self._max_jobs} jobs that run or wait, and takes no more",
+            hint="send the command again after retry_after_ms",
+            retry_after_ms=_BUSY_RETRY_MS,
+        )
+
     def _fail(self, queued: QueuedCommand, error: RsePfError) -> None:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
 
@@ -298,7 +306,3 @@ def _settings_digest(settings: PlatformSettings) -> str:
     plain = settings.to_dict()
     chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
     return hashlib.sha256(chosen.encode()).hexdigest()
-
-
-def _too_many_error() -> Busy:
-    return Busy("too many jobs wait", hint="try again later", retry_after_ms=_BUSY_RETRY_MS)

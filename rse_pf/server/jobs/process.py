@@ -179,7 +179,8 @@ def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettin
     _, compute_ms, reply = answer
     try:
         if len(reply) > settings.data.max_object_bytes:
-            raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
+            limit = settings.data.max_object_bytes
+            raise LimitExceeded(f"the reply has {len(reply)} bytes, above {limit}", hint="request less")
         store = open_data_store(settings)
         accounts = Accounts(store, settings.data)
         digest = retry_store(

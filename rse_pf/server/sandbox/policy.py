@@ -52,6 +52,7 @@ START_TIMEOUT_S = 5.0  # a sandbox that is not ready within this time is killed
 _MAX_TRIES = 2  # of a command whose sandbox crashed: the crash may have had another cause
 _BUSY_RETRY_MS = 1000.0  # pause of a robot that gets no sandbox
 _KEPT_S = 3.0  # a free place is kept for a tenant: its refused robot has sent again within this time
+_DEADLINE_HINT = "set a longer deadline, or send fewer commands to this service"
 _DEADLINE_FACTOR = 2.0  # a sandbox is killed when its command has taken this many times its deadline
 
 
@@ -385,7 +386,7 @@ class SandboxPolicy:
                 continue
             if call is not None and sandbox.late_s <= now:
                 sandbox.late_s = math.inf
-                self._answer(call, Expired("the service did not answer before the deadline"))
+                self._answer(call, Expired("the service did not answer in time", hint=_DEADLINE_HINT))
             if sandbox.kill_s <= now:
                 sandbox.is_overrun = call is not None and not sandbox.fault  # else it is being killed
                 self._kill(sandbox, "it did not start in time" if call is None else "it took too long")
@@ -444,7 +445,7 @@ class SandboxPolicy:
     def _no_place_error(self) -> Busy:
         return Busy(
             f"all {self._max_sandboxes} sandboxes of this server are in use",
-            hint="try again later",
+            hint="send the command again after retry_after_ms",
             retry_after_ms=_BUSY_RETRY_MS,
         )
 
@@ -524,7 +525,7 @@ class SandboxPolicy:
             call = sandbox.waiting.popleft()
             queued, refusal = call.queued, self._refusal(call, now)
             if refusal is None and queued.deadline_s <= now:
-                refusal = Expired("the deadline passed before the work began")
+                refusal = Expired("the deadline passed before the service was called", hint=_DEADLINE_HINT)
             if refusal is not None:
                 self._answer(call, refusal)
                 continue

@@ -24,8 +24,8 @@ from rse_pf.server.scheduling.overload import PAUSE_S, OverloadControl, WaitPerP
 
 __all__ = ["BEHIND", "BEHIND_HINT", "INLINE_BYTES", "Scheduler", "behind_error", "expired_error"]
 
-BEHIND = "the server is behind with its work"
-BEHIND_HINT = "try again later; another server may have been added"
+BEHIND = "the server is overloaded: the command would wait for too much of its deadline"
+BEHIND_HINT = "send the command again after retry_after_ms; add servers if this happens often"
 
 INLINE_BYTES = 16_384  # a larger command is computed in a thread: decoding it would delay other robots
 SHORT_COMPUTE_S = 0.001  # passing a command to a thread costs 0.1 ms of CPU and up to 5 ms of waiting for it
@@ -160,7 +160,8 @@ def expired_error(queued: QueuedCommand, now: float) -> Expired:
     """Return the error of a command whose deadline passed before its turn."""
     waited_ms = (now - queued.received_s) * 1e3
     return Expired(
-        f"its deadline passed after {waited_ms:.0f} ms in the queue", hint="allow more time, or send fewer"
+        f"its deadline passed after {waited_ms:.0f} ms in the queue",
+        hint="set a longer deadline, or send fewer commands",
     )
 
 
