@@ -6,8 +6,8 @@
 
 The peer runs in its own environment and process (`orbslam3_process.py`), gets images and gives trajectory
 files; nothing of it is imported here.  It is paced by its own threads, or by the time stamps at --speed times
-real time; our tracker runs as in `rse-pf compare`.  Writes ``comparison.json`` and ``report.md``, figures
-only; rows and parts that are not measured now are kept as they were.
+real time; our tracker runs as in `rse-pf compare`.  Writes ``comparison.json``, ``runs.csv`` and
+``report.md``, figures only; rows and parts that are not measured now are kept as they were.
 
 Defends nothing: both are reported, with every run.
 """
@@ -15,6 +15,8 @@ Defends nothing: both are reported, with every run.
 from __future__ import annotations
 
 import asyncio
+import csv
+import io
 import json
 import subprocess
 import sys
@@ -313,45 +315,59 @@ def _rectified(left: Intrinsics, right: Intrinsics, T_left_right: Array) -> Arra
 
 
 def report_page(report: dict[str, Any]) -> str:
-    """Return ``report.md``."""
+    """Return ``report.md``: our run and the best run of the peer for each row; ``runs.csv`` has all runs."""
     about = report["environment"]
     head = (
-        "recording", "frames", "sensor", "who", "run", "posed", "longest gap s", "ATE cm",
-        "ATE cm, as returned", "RPE cm / deg over 1 s", "CPU ms a frame",
+        "recording", "frames", "sensor", "posed: ours, peer", "ATE cm: ours, peer",
+        "RPE cm / deg over 1 s: ours, peer", "ours is behind",
     )  # fmt: skip
     return page(
-        "# Our tracker beside ORB-SLAM3",
+        "# Our tracker compared with ORB-SLAM3",
         f"Commit {about['commit']}. {report.get('peer', 'No peer')}; {_pace(report.get('speed', 0.0))}; "
         f"ours once: it is deterministic. {about['cores']} cores, {about['system']}, Python "
         f"{about['python']}; load average {about['load_average']} before our runs, "
-        f"{report['load_average_after']} after them.",
-        table(head, [cells for row in report["rows"] for cells in _rows_of(row)]),
-        "## Where ours is behind",
-        [*(_behind(report["rows"]) or ["- nowhere"])],
+        f"{report['load_average_after']} after them. Of the peer, the best run is shown; "
+        "[runs.csv](runs.csv) has all runs, gaps, poses as returned, and CPU times.",
+        table(head, [_summary_of(row) for row in report["rows"]]),
         "## What is not comparable",
         _NOT_COMPARABLE,
     )
 
 
-def _behind(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a line for each row in which the best run of the peer has more poses, or nearer ones."""
-    lines = []
-    for row in rows:
-        finals = [run["final"] for run in row.get("peer", ()) if "final" in run]
-        ours = row.get("ours")
-        name = f"- {row['name']}, {row['sensor'].lower()}"
-        if ours is None:
-            lines.append(f"{name}: we have no such tracker")
-            continue
-        for run in sorted(finals, key=lambda final: (-final["posed"], final["ate_cm"] or np.inf))[:1]:
-            is_nearer = run["ate_cm"] is not None and run["ate_cm"] < (ours["ate_cm"] or np.inf)
-            has_as_many = run["posed"] >= _AS_MANY * ours["posed"]
-            if run["posed"] > ours["posed"] or (has_as_many and is_nearer):
-                lines.append(
-                    f"{name}: {ours['posed']} posed, {_fixed(ours['ate_cm'])} cm, beside {run['posed']}, "
-                    f"{_fixed(run['ate_cm'])} cm of its best run"
-                )
-    return lines
+def runs_table(report: dict[str, Any]) -> str:
+    """Return ``runs.csv``: a line for each run."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        ("recording", "frames", "sensor", "who", "run", "posed", "longest gap s", "ATE cm",
+         "ATE cm, as returned", "RPE cm / deg over 1 s", "CPU ms a frame")
+    )  # fmt: skip
+    writer.writerows(cells for row in report["rows"] for cells in _rows_of(row))
+    return text.getvalue()
+
+
+def _summary_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the line of a row in the report."""
+    finals = [run["final"] for run in row.get("peer", ()) if "final" in run]
+    best = min(finals, key=lambda final: (-final["posed"], final["ate_cm"] or np.inf), default=None)
+    ours = row.get("ours")
+    both = (ours, best)
+    return (
+        row["name"], row["frames"], f"{row['sensor'].lower()}, {row['alignment']}",
+        ", ".join("none" if run is None else str(run["posed"]) for run in both),
+        ", ".join("-" if run is None else _fixed(run["ate_cm"]) for run in both),
+        ", ".join("-" if run is None else _rpe(run) for run in both),
+        "yes" if _is_behind(ours, best) else "",
+    )  # fmt: skip
+
+
+def _is_behind(ours: dict[str, Any] | None, best: dict[str, Any] | None) -> bool:
+    """Whether the best run of the peer has more poses, or about as many with a lower error."""
+    if ours is None or best is None:
+        return ours is None
+    is_nearer = best["ate_cm"] is not None and best["ate_cm"] < (ours["ate_cm"] or np.inf)
+    has_as_many = best["posed"] >= _AS_MANY * ours["posed"]
+    return bool(best["posed"] > ours["posed"] or (has_as_many and is_nearer))
 
 
 def _pace(speed: float) -> str:
@@ -389,6 +405,10 @@ def _rows_of(row: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
 def _cpu(run: dict[str, Any]) -> str:
     """Return the peer's CPU of a frame; unknown where looking at its threads was not counted apart."""
     return f"{run['cpu_ms_a_frame']:.0f}" if "looking_ms_a_frame" in run else "not known"
+
+
+def _rpe(run: dict[str, Any]) -> str:
+    return f"{_fixed(run['rpe_cm'])} / {_fixed(run['rpe_deg'])}"
 
 
 def _fixed(value: float | None) -> str:
@@ -429,6 +449,7 @@ def run_benchmark(args: Options) -> dict[str, Any]:
             report["load_average_after"] = load_average()
             write_json(file, report)
             (args.folder / "report.md").write_text(report_page(report), encoding="utf-8")
+            (args.folder / "runs.csv").write_text(runs_table(report), encoding="utf-8")
     return {"rows": report["rows"]}
 
 
