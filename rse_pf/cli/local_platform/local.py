@@ -197,10 +197,12 @@ class _FaultRequest(_ServerRequest):
         "--for", metavar="S", help="end the fault after S seconds (default: with Ctrl-C)"
     )
 
-    def waiter(self) -> Callable[[float], bool]:
-        """Return the function that waits for the end of the fault; raises UsageError for a wrong time."""
+    def __post_init__(self) -> None:
         if self.for_s is not None and not self.for_s > 0:
             raise UsageError("--for takes a positive number of seconds", hint="leave it out")
+
+    def waiter(self) -> Callable[[float], bool]:
+        """Block the signals that end a fault, and return the function that waits for the end."""
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
         end_s = math.inf if self.for_s is None else time.monotonic() + self.for_s
         return functools.partial(_wait, end_s)

@@ -334,11 +334,11 @@ def test_slow_ends_with_ctrl_c_and_the_server_is_whole(terminal: Terminal) -> No
     ("words", "said"),
     [
         (("kill", "server-9"), "no server named 'server-9' is running"),
-        (("kill",), "rse-pf local kill needs a server"),
-        (("status", "server-1"), "rse-pf local status takes no server"),
-        (("slow", "server-1"), "--percent belongs to slow"),
+        (("kill",), "rse-pf local kill: the following arguments are required: SERVER"),
+        (("status", "server-1"), "rse-pf local status: unrecognized arguments: server-1"),
+        (("slow", "server-1"), "rse-pf local slow: the following arguments are required: --percent"),
         (("pause", "server-1", "--for", "-1"), "--for takes a positive number"),
-        (("kill", "server-1", "--for", "1"), "--for takes a positive number"),
+        (("kill", "server-1", "--for", "1"), "rse-pf local kill: unknown option --for"),
     ],
 )
 def test_a_wrong_word_is_two_lines_and_breaks_nothing(
