@@ -58,7 +58,7 @@ class Admission:
         self.rates = RobotRates(session)
         self.too_fast = UnreadRefusal(
             "rate",
-            f"this robot sends more than {session.max_commands_per_s:g} messages a second",
+            f"this robot exceeds its rate of {session.max_commands_per_s:g} messages a second",
             "send fewer messages, or have the operator raise session.max_commands_per_s",
         )
         self._max_queue = max_queue
