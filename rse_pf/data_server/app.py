@@ -164,7 +164,8 @@ class DataServer:
             trace = uuid.uuid4().hex
             line |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"search its log for {trace}"))
-        # After a small body that is here the connection goes on; otherwise it ends with the reply.
+        # After a small body that has arrived the connection stays open; otherwise it is closed after the
+        # reply.
         if not request.is_complete and (
             reply.status == _REQUEST_TIMEOUT or not await request.drain_soon(self._settings.data.part_bytes)
         ):

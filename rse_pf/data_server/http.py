@@ -177,7 +177,7 @@ class HttpRequest:
                 if self._refusal is not None:  # wait_for of Python 3.10 may lose a cancellation
                     raise self._refusal
         except asyncio.CancelledError:
-            if self._refusal is None:  # the client is gone
+            if self._refusal is None:  # the client has disconnected
                 raise
             raise self._refusal from None
         finally:

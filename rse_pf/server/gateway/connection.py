@@ -126,7 +126,7 @@ class RobotConnection:
             self._wire.close(decision.code, decision.reason)
 
     def answer(self, data: bytes, command_id: int) -> None:
-        """Write the final answer to a command; does nothing if the socket is gone."""
+        """Write the final answer to a command; does nothing if the socket is closed."""
         session = self.session
         if self.is_connected and session is not None:
             session.in_flight -= 1

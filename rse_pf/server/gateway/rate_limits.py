@@ -2,7 +2,7 @@
 
 A robot has one bucket for all of its sockets of one worker: ``session.max_commands_per_s`` tokens a second,
 and at most `command_burst` tokens.  Each message takes one.  A message that finds the bucket empty is refused
-with the time until the next token.  A robot that goes on regardless is disconnected and banned:
+with the time until the next token.  A robot that keeps sending is disconnected and banned:
 
 1. `command_burst` refusals are one violation.
 2. `_MAX_VIOLATIONS` violations within `_VIOLATIONS_WINDOW_S` end the connection with close code 4429.

@@ -117,7 +117,7 @@ class PendingSocket:
     def close(self, answer: bytes = b"") -> None:
         """Send *answer*, if there is one, and close the socket."""
         if answer:
-            # An answer is far shorter than what the kernel buffers; a robot that is gone gets none.
+            # An answer is far shorter than what the kernel buffers; a robot that has disconnected gets none.
             with contextlib.suppress(OSError):
                 self.accepted.send(answer)
         self.accepted.close()
@@ -342,7 +342,7 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
             rest: Bytes that were read behind the robot's request.
             max_frame_bytes: A longer frame ends the connection.
             poller: Reads the rest of a message that is longer than one read, after other sockets.
-            on_end: Called when the socket is gone.
+            on_end: Called when the socket is closed.
         """
         answer = picows.WSUpgradeResponseWithListener(_Upgrade(subprotocol), listener)
         auto_ping = (False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE)

@@ -222,7 +222,7 @@ def _enable(hierarchy: Hierarchy) -> None:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove the empty cgroups of zygotes that are gone."""
+    """Remove the empty cgroups of zygotes that have exited."""
     for cgroup in folder.glob(f"{_PREFIX}*-*"):
         owner = cgroup.name.removeprefix(_PREFIX).partition("-")[0]
         if owner.isdigit() and not Path("/proc", owner).exists():

@@ -101,7 +101,7 @@ class IpcChannel:
         except BlockingIOError:
             pass
         except OSError:
-            self._unsent.clear()  # the sandbox is gone; the reader reports it
+            self._unsent.clear()  # the sandbox has ended, which the reader reports
         if self._unsent:
             self._loop.add_writer(self._socket.fileno(), self._flush)
         else:

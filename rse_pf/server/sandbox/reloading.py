@@ -78,7 +78,7 @@ class ReloadingSandboxes(CommandQueue):
         self._give_up: TimerHandle | None = None
         self._past_s: defaultdict[str, float] = defaultdict(float)
         self._past: Counter[str] = Counter()
-        """What the sandboxes that are gone have counted."""
+        """Counts of sandboxes that have ended."""
         self._current = _Generation(())
 
     def start(self, services: Sequence[InstalledService]) -> None:

@@ -55,7 +55,7 @@ class MemoryWatcher:
         return reasons
 
     def used_bytes(self, pid: int) -> int:
-        """Return the memory of a sandbox, 0 if it is gone.
+        """Return the memory of a sandbox in bytes, 0 if it has ended.
 
         Pages that processes share count in proportion, but only near the limit, where that matters: adding
         them up takes milliseconds.

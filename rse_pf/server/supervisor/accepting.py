@@ -116,7 +116,7 @@ class RobotAcceptor:
                 fd, address = self._accept()
             except BlockingIOError:
                 return
-            except OSError as error:  # out of descriptors, or the robot is gone already
+            except OSError as error:  # no descriptor is left, or the robot has closed the socket
                 self._on_refused(str(error))
                 self._pause_accepting(_REFUSED_PAUSE_S)
                 return

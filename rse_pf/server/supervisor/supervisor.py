@@ -510,7 +510,7 @@ class _Supervisor:
         }
 
     async def _post_services(self, ask: ControlRequest) -> ControlReply:
-        """Load the services folder anew; /status shows the services that every worker runs."""
+        """Load the services folder again; /status shows the services that every worker runs."""
         if not (ask.is_local and self._settings.services.follow):
             return refused_reply(403, "forbidden", "only here, and with --follow-services")
         for worker in self._workers:

@@ -452,7 +452,7 @@ class _Worker:
             self._flushing = True
             self._loop.call_later(_POLL_S, self._flush_ends)
         except OSError:
-            self._ended = 0  # the supervisor is gone; the control channel ends this process
+            self._ended = 0  # the supervisor has exited; the control channel ends this process
 
     def _new_name(self) -> str:
         self._named += 1

@@ -185,7 +185,7 @@ class WorkerProcess:
         return True
 
     def order(self, order: WorkerOrder) -> None:
-        """Send *order*; one to a worker that is gone is lost."""
+        """Send *order*; it is lost if the worker has exited."""
         if self._writer is not None and not self._writer.is_closing():
             self._writer.write(encode_order(order))
 

@@ -41,7 +41,8 @@ __all__ = [
 FIRST_RETRY_S = 0.05
 """Seconds after which an operation of the object store that failed is tried again for the first time."""
 _MAX_RETRY_S = 1.0
-"""Longest wait in seconds between two tries of a failing object store: a map goes on soon after an outage."""
+"""Longest wait in seconds between two tries of a failing object store: a map continues soon after an
+outage."""
 _MATCHING_THREADS = 3
 """Number of threads that match keyframes: one more than the measurements of loop closures that run at the
 same time, so that a robot can be relocalised meanwhile.  Matching and solving release Python's interpreter

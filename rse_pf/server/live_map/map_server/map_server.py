@@ -480,7 +480,7 @@ class MapServer:
         """Publish the map, give its lease up as stopped, and delete its log.
 
         The reply names the version; it is empty if the map has no keyframes.  If the publication fails, the
-        map goes on, and the error is raised.
+        map continues to be served, and the error is raised.
         """
         background, record = self._environment.threads.background, None
         # 1. Publish the map as a version.  The log is deleted afterwards, so its bytes need not be free in

@@ -1,4 +1,4 @@
-"""Measure loop closures of new keyframes and optimise the whole pose graph, while the map goes on.
+"""Measure loop closures of new keyframes and optimise the whole pose graph, while the map is served.
 
 A keyframe is acknowledged before its loop closures are measured.  The results enter the log of the map as
 events of their own, so that a replay of the log measures nothing.

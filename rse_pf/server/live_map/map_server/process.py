@@ -80,7 +80,7 @@ _PROBES = {
 }
 """For each address that stands for all interfaces: its family, an address reserved for documentation (RFC
 5737, RFC 3849), to which nothing is sent, and the loopback address.  The operating system's route to the
-second address tells the address of this machine's main network interface."""
+second address gives the address of this machine's main network interface."""
 _PROBE_PORT = 9  # any port: nothing is sent to it
 _T = TypeVar("_T")
 

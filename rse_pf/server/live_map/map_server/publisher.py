@@ -269,7 +269,7 @@ class Publisher:
         the same bytes as a version that stays.
 
         Raises:
-            Busy, StoreError: The removal is not complete; the next publication goes on.
+            Busy, StoreError: The removal is not complete; the next publication continues it.
         """
         keep, account = self._environment.settings.keep_versions, self._environment.account
         if not keep:

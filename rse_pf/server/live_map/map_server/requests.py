@@ -123,7 +123,7 @@ class RequestHandler:
         """Add a keyframe to the map; the reply names the number of the robot's next keyframe.
 
         If the robot sends a keyframe again while it is being added, both requests wait for the same addition,
-        which goes on if a request is cancelled.
+        which continues if a request is cancelled.
         """
         event = KeyframeAdded(
             robot=robot.folder, segment=request.segment, number=request.number, data=request.keyframe

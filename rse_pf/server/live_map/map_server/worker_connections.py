@@ -36,7 +36,7 @@ _MAX_CONCURRENT_REQUESTS = 256
 of the worker, so that memory is bounded."""
 _FLUSH_S = 2.0
 """Seconds for which a map server waits until its last messages are written to the sockets of workers, when
-the map is given up and before a refused connection is closed; then it goes on, although messages may be
+the map is given up and before a refused connection is closed; then it continues, although messages may be
 lost."""
 
 
