@@ -206,17 +206,3 @@ def test_the_status_of_an_ill_fleet_leads_to_the_runbook(
     assert "robots: not reported" in page
     assert "no server has reported" in page
     assert "docs/operations.md#unhealthy" in page
-
-
-def test_leftovers_are_listed_with_the_command_that_removes_them(
-    capsys: pytest.CaptureFixture[str], emulator: None
-) -> None:
-    import boto3
-
-    assert main(["cloud", "leftovers"]) == 0
-    boto3.client("logs", region_name=REGION).create_log_group(logGroupName="RsePf-Network-Flow")
-
-    assert main(["cloud", "leftovers"]) == 1
-    page = capsys.readouterr().out
-    assert "remove: aws logs delete-log-group --log-group-name RsePf-Network-Flow" in page
-    assert page.endswith("1 left over\n")

@@ -110,26 +110,6 @@ def test_an_opencv_that_does_not_work_is_named_with_its_repair_and_ends_the_demo
     assert demo.returncode == 2
 
 
-def test_a_missing_native_core_fails_with_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rse_pf.native.find_library", lambda: None)
-    finding = only("the native core is not installed", findings())
-
-    assert finding.grade == "fail"
-    assert "make native" in finding.fix
-
-
-@pytest.mark.parametrize(("missing", "grade"), [([], "ok"), (["namespaces"], "warn")])
-def test_the_means_of_isolation_are_listed(
-    monkeypatch: pytest.MonkeyPatch, missing: list[str], grade: str
-) -> None:
-    monkeypatch.setattr("rse_pf.server.sandbox.isolation.missing_isolation", lambda _: missing)
-    told = only("isolation", findings())
-
-    assert told.grade == grade
-    assert "seccomp" in told.what
-    assert ("missing: namespaces" in told.what) == bool(missing)
-
-
 @pytest.mark.parametrize(("grade", "code"), [("ok", 0), ("warn", 0), ("fail", 1)])
 def test_the_exit_code_is_1_only_if_something_required_failed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], grade: str, code: int

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import multiprocessing
 import os
 import signal
@@ -37,12 +36,6 @@ def test_has_the_public_methods_of_the_robot():
     assert public(client_sdk.BlockingRobot) == public(client_sdk.Robot) - for_loops_only
 
 
-def test_connects_with_the_same_arguments_as_the_robot():
-    ours, theirs = client_sdk.connect_blocking, client_sdk.connect
-
-    assert inspect.signature(ours).parameters == inspect.signature(theirs).parameters
-
-
 def test_a_closed_robot_is_disconnected_and_may_be_closed_again(url):
     with client_sdk.connect_blocking(url) as robot:
         robot.close()
@@ -57,13 +50,6 @@ def test_calls_and_raises_like_the_robot(url):
         with pytest.raises(UnknownService):
             robot.call("nothing", {})
         assert robot.stats.answered == 1
-
-
-def test_leaves_no_thread_behind(url):
-    with client_sdk.connect_blocking(url) as robot:
-        robot.call("echo", {})
-    assert not [thread for thread in threading.enumerate() if thread.name == "rse-pf-robot"]
-    assert not [thread for thread in threading.enumerate() if thread.name == "rse-pf-callbacks"]
 
 
 def test_a_call_ends_at_its_deadline_although_the_event_loop_hangs(url):

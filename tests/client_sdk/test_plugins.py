@@ -24,10 +24,9 @@ from client_sdk.plugins import (
     load_features,
     load_function,
 )
-from client_sdk.tracking.landmark_matching import make_place_vector
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, exp_se3
-from rse_pf.maps.descriptors import ORB, DescriptorKind
+from rse_pf.maps.descriptors import ORB
 from rse_pf.maps.format import decode_map
 from tests.kit.fake_live_map import solve
 from tests.kit.flat_world import STEP_M, frame_at, tracked
@@ -69,20 +68,6 @@ def sift(rgb: npt.NDArray[np.uint8]) -> FoundFeatures:
     points, descriptors = cv2.SIFT_create(1500).detectAndCompute(gray, None)
     return FoundFeatures(
         pixels=cv2.KeyPoint_convert(points), scores=[p.response for p in points], descriptors=descriptors
-    )
-
-
-def test_features_come_back_best_first() -> None:
-    plugin = plugin_of(found(scores=[0.1, 0.9, 0.5, 0.2, 0.3, 0.4]))
-
-    features = plugin(IMAGE)
-
-    assert features.scores.tolist() == [0.9, 0.5, 0.4, 0.3, 0.2, 0.1]
-    assert np.array_equal(features.pixels[0], np.asarray(found().pixels)[1])
-    assert (plugin.kind, plugin.is_oriented, plugin.is_scaled) == (
-        DescriptorKind("mine", "int8", 64),
-        False,
-        False,
     )
 
 
@@ -298,20 +283,6 @@ def test_a_loops_function_says_which_keyframes_are_tried(depth: bool) -> None:
     assert set(seen) == {frame_at(0, depth=True).rgb.shape}
 
 
-def test_the_place_vector_of_an_image_is_computed_once() -> None:
-    calls: list[int] = []
-
-    def loops(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
-        calls.append(len(rgb))
-        return np.ones(16)
-
-    place = make_place_vector(ORB.empty(), IMAGE, LoopsPlugin(loops))
-
-    assert calls == []
-    assert np.array_equal(place.get(), place.get())
-    assert calls == [480]
-
-
 @pytest.mark.parametrize(
     ("returned", "why"),
     [
@@ -371,20 +342,6 @@ def test_an_optimiser_must_return_all_poses_and_points(returned: Any, why: str) 
 
 
 # --- names on the command line -----------------------------------------------------------------
-
-
-def test_a_function_is_found_in_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "own_features.py").write_text("def corners(rgb):\n    return None\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-
-    function = load_features("own_features:corners")
-
-    assert function is not None
-    assert function.__name__ == "corners"
-    assert load_features(None) is None
 
 
 @pytest.mark.parametrize(

@@ -16,32 +16,9 @@ from tests.oracles import depths
 CAMERA = Camera(fx=20.0, fy=20.0, cx=9.5, cy=7.5, width=20, height=16)
 
 
-def flat_frame(depth_m: float = 2.0) -> Frame:
-    rgb = np.full((16, 20, 3), (10, 20, 30), dtype=np.uint8)
-    return Frame(timestamp_s=0.0, rgb=rgb, depth_m=np.full((16, 20), depth_m, np.float32), camera=CAMERA)
-
-
 def random_points(seed: int, count: int, spread_m: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return rng.uniform(-spread_m, spread_m, (count, 3)), rng.integers(0, 256, (count, 3)).astype(np.uint8)
-
-
-def test_points_of_one_voxel_become_their_mean():
-    cloud = PointMap(MapOptions(voxel_m=0.02))
-
-    cloud.add_points(
-        np.array([[0.001, 0.001, 0.001], [0.003, 0.005, 0.007]]),
-        np.array([[0, 0, 0], [100, 50, 10]], np.uint8),
-    )
-    cloud.add_points(
-        np.array([[0.008, 0.006, 0.004], [-0.001, 0.001, 0.001]]),
-        np.array([[50, 70, 80], [1, 2, 3]], np.uint8),
-    )
-
-    points, colours = cloud.points()
-    np.testing.assert_allclose(points, [[0.004, 0.004, 0.004], [-0.001, 0.001, 0.001]], atol=1e-7)
-    np.testing.assert_array_equal(colours, [[50, 40, 30], [1, 2, 3]])
-    assert len(cloud.points(min_readings=2)[0]) == 1
 
 
 def test_a_map_in_many_pieces_equals_the_map_in_one():
@@ -55,21 +32,6 @@ def test_a_map_in_many_pieces_equals_the_map_in_one():
     assert len(whole) == len(pieces) == len(np.unique(np.floor(points / 0.1), axis=0))
     a, b = (cloud.points()[0] for cloud in (whole, pieces))
     np.testing.assert_allclose(a[np.lexsort(a.T)], b[np.lexsort(b.T)], atol=1e-4)
-
-
-def test_a_frame_lands_where_its_pose_says():
-    cloud = PointMap(MapOptions(voxel_m=0.05, every_px=1))
-    pose = np.eye(4)
-    pose[:3, 3] = [1.0, 2.0, 3.0]
-
-    used = cloud.add(flat_frame(), pose)
-
-    points, colours = cloud.points()
-    assert used == 320
-    np.testing.assert_allclose(points[:, 2], 5.0, atol=1e-6)
-    # pixel (0, 0) lies at x = (0 - 9.5) / 20 * 2 = -0.95, y = (0 - 7.5) / 20 * 2 = -0.75
-    np.testing.assert_allclose(points.min(axis=0)[:2], [0.05, 1.25], atol=1e-6)
-    assert (colours == [10, 20, 30]).all()
 
 
 @pytest.mark.parametrize("every_px", [1, 2, 3])

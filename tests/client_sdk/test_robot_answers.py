@@ -8,19 +8,15 @@ from random import Random
 import pytest
 
 import client_sdk
-from client_sdk.commands.traffic_stats import TrafficCounter
 from client_sdk.network.connect_timings import ConnectTimings
-from rse_pf import native
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import (
     BadMessage,
     Busy,
     LimitExceeded,
-    MissingExtra,
     NoConsensus,
     TooFewCorrespondences,
 )
-from rse_pf.pnp.native_solver import native_solver
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.echo import EchoReply
@@ -140,30 +136,3 @@ async def test_a_frame_without_a_pose_is_no_reason_to_solve_it_again():
                 await robot.solve_pnp(good.points_world[:3], good.pixels[:3], good.camera, deadline_s=5)
 
             assert robot.stats.answered_by_robot == 0
-
-
-async def test_a_robot_without_the_native_core_is_told_what_to_install(monkeypatch):
-    async with FakePlatform() as platform:
-        monkeypatch.setattr(native, "find_library", lambda: None)
-        native_solver.cache_clear()
-        with pytest.raises(MissingExtra, match="the native core") as raised:
-            await connect(platform, offload=client_sdk.CloudFirst()).__aenter__()
-        assert "rse-pf[vision]" in raised.value.hint
-        assert not platform.sockets
-
-
-def test_the_stats_of_a_long_run_keep_their_size_and_their_percentiles():
-    keeper = TrafficCounter(Random(3))
-    for value in range(50_000):
-        keeper.add("round_trip_ms", value)
-
-    assert len(keeper._samples["round_trip_ms"].values) == 2048
-    assert keeper.percentile("round_trip_ms", 0.5) == pytest.approx(25_000, abs=2_000)
-    assert keeper.percentile("round_trip_ms", 0.95) == pytest.approx(47_500, abs=1_000)
-
-
-def test_every_public_name_is_there_and_an_unknown_one_is_not():
-    assert {"connect", "connect_blocking", "CloudFirst", "PointMap", "Stats"} <= set(client_sdk.__all__)
-    assert dir(client_sdk) == sorted(client_sdk.__all__)
-    with pytest.raises(AttributeError, match="teleport"):
-        client_sdk.teleport  # noqa: B018  the lookup is what raises

@@ -112,36 +112,6 @@ def test_a_welcome_that_cannot_be_read_rejects_connect_with_a_typed_error() -> N
     assert against(lambda _: b"no zlib stream", program) == ["protocol", True, True]
 
 
-def test_a_renewal_that_nobody_answered_ends_with_the_robot() -> None:
-    def answers(message: dict[str, Any]) -> bytes | None:
-        return None if message["type"] == "renew" else echo(message)
-
-    program = """
-    const robot = await connect(url, { token: "t" });
-    const began = performance.now();
-    const renewed = codeOf(robot.renew("u"));
-    robot.close();
-    say([await renewed, performance.now() - began < 2000, await codeOf(robot.renew("v"))]);
-    """
-
-    assert against(answers, program) == ["disconnected", True, "disconnected"]
-
-
-def test_a_token_function_that_throws_is_a_typed_error_of_an_upload() -> None:
-    program = """
-    let isFirst = true;
-    const token = () => {
-      if (!isFirst) throw null;
-      isFirst = false;
-      return "t";
-    };
-    const robot = await connect(url, { token });
-    say(await codeOf(robot.upload(new Uint8Array(3))));
-    """
-
-    assert against(echo, program) == "connect"
-
-
 # The time limit of a token function, 30 s, is 30 ms.
 QUICK = """
 const { setTimeout } = globalThis;
@@ -159,17 +129,6 @@ def test_a_token_function_that_never_answers_counts_as_failed_and_is_asked_again
     """
 
     assert against(echo, program) == ["ok", 2, 1]
-
-
-def test_a_first_connect_rejects_when_its_token_function_never_answers() -> None:
-    program = f"""{QUICK}
-    let asked = 0;
-    const late = new Promise((done) => setTimeout(done, 20e3, "late"));
-    const connected = codeOf(connect(url, {{ token: () => (asked++, never) }}));
-    say([await Promise.race([connected, late]), asked]);
-    """
-
-    assert against(echo, program) == ["connect", 4]
 
 
 def test_callbacks_that_fail_are_counted_and_the_robot_goes_on() -> None:
@@ -202,32 +161,6 @@ def test_callbacks_that_fail_are_counted_and_the_robot_goes_on() -> None:
     """
 
     assert against(answers, program) == [["ok"], 2, "ended", 4, 2, 2]
-
-
-def test_a_failure_is_counted_each_time_and_printed_once_for_each_place_that_throws() -> None:
-    def answers(message: dict[str, Any]) -> bytes | None:
-        if message["type"] == "subscribe":
-            return said({"type": "update", "id": message["id"], "key": "k", "payload": 1, "seq": 1})
-        return echo(message)
-
-    program = """
-    const printed = [];
-    console.error = (...words) => printed.push(`${words.at(-1)}`);
-    let count = 0;
-    const fails = [
-      () => { throw new Error("first " + count); },
-      async () => { throw new Error("second " + count); },
-      () => { throw "a text"; },
-    ];
-    const robot = await connect(url, { token: "t" });
-    for (let i = 0; i < 9; i++) {
-      await new Promise((done) => robot.subscribe("a", () => { count++; done(); return fails[i % 3](); }));
-    }
-    await robot.call("echo", 1);
-    say([printed, robot.stats.callbackErrors]);
-    """
-
-    assert against(answers, program) == [["Error: first 1", "Error: second 2", "a text"], 9]
 
 
 def test_a_program_that_blocks_for_long_connects_again_and_sends_nothing_twice() -> None:

@@ -35,16 +35,6 @@ def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "node_modules" / ".bin"
 
 
-def test_the_package_names_its_files_and_needs_nothing() -> None:
-    package = json.loads((CLIENT / "package.json").read_text(encoding="utf-8"))
-
-    assert package["name"] == "rse-pf"
-    assert not {"dependencies", "devDependencies", "peerDependencies", "scripts"} & set(package)
-    assert package["license"] == "Apache-2.0"
-    named = {package["main"], package["types"], *package["exports"]["."].values(), *package["files"]}
-    assert all((CLIENT / name).is_file() for name in named)
-
-
 @pytest.mark.slow
 def test_the_minified_module_has_at_most_12_kb_and_decodes_every_golden_message(
     tools: Path, tmp_path: Path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -63,16 +62,6 @@ def test_a_cover_and_a_tag_are_found_where_they_are(service: Runtime, seed: int)
     assert degrees <= 4.0
 
 
-def test_tags_alone_are_found_where_they_were_found_with_objects(service: Runtime) -> None:
-    cover, tag = placed(0)
-    request = request_of(draw_scene(COVER, cover, tag, tag=7, seed=0))
-
-    alone = service.call(request | {"tags_only": True}).found
-
-    assert [each.name for each in alone] == ["tag36h11:7"]
-    assert (alone[0].T_camera_object == service.call(request).found[1].T_camera_object).all()
-
-
 @pytest.mark.parametrize(
     "wrong",
     [{"image": b""}, {"image": b"no image"}, {"camera": [525.0]}, {"camera": [0.0] * 4}, {"tag_m": 0.0}],
@@ -93,10 +82,3 @@ def test_the_recorded_requests_give_their_replies_in_the_sandbox(
     assert main(["service", "test", str(FOLDER)]) == 0
 
     assert f"{count} of {count} recorded requests as expected" in capsys.readouterr().out
-
-
-def test_every_object_has_a_picture_and_a_width() -> None:
-    widths = json.loads((FOLDER / "objects" / "objects.json").read_text())
-
-    assert widths == {"cover": 0.2}
-    assert {path.stem for path in (FOLDER / "objects").glob("*.png")} == set(widths)

@@ -62,28 +62,6 @@ def test_the_boxes_show_what_aws_knows_and_say_what_it_does_not() -> None:
     assert json.loads(json.dumps(told)) == told
 
 
-@pytest.mark.parametrize(
-    ("state", "targets", "shown"),
-    [
-        ("InService", ("healthy", "healthy"), "healthy"),
-        ("InService", ("healthy", "unhealthy"), "unhealthy"),
-        ("InService", ("initial",), "starting"),
-        ("InService", ("absent",), "starting"),
-        ("Pending:Wait", (), "starting"),
-        ("Terminating:Wait", ("draining",), "draining"),
-        ("Standby", (), "Standby"),
-    ],
-)
-def test_the_states_of_aws_are_told_in_the_words_of_a_local_platform(
-    state: str, targets: tuple[str, ...], shown: str
-) -> None:
-    server = dataclasses.replace(HEALTHY, state=state, targets=targets)
-
-    (told,) = cloud_document(overview(server), metrics((1.0,)), SETTINGS, time_s=NOW_S)["servers"]
-
-    assert told["state"] == shown
-
-
 def test_an_alarm_and_a_missing_server_are_told_with_the_runbook() -> None:
     alarmed = overview(HEALTHY, wanted=2, alarms={"silent": "ALARM"}, reasons={"silent": "no data\x1b"})
 

@@ -14,7 +14,7 @@ from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.extensions.fleet_page import clouds
-from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories
+from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, RobotPaths
 from rse_pf.extensions.fleet_page.feeds.platform_feed import (
     LocalFeed,
     fleet_document,
@@ -67,20 +67,6 @@ def test_the_path_of_a_robot_lies_in_its_odometry_frame_so_that_corrections_move
     assert told is not None
     np.testing.assert_allclose(told["points"], [[0.0, -2.0, 0.0]], atol=1e-3)
     assert paths.take({**pose, "segment": 1}) is None
-
-
-def test_the_history_of_a_robot_has_all_its_segments_and_its_name_is_escaped() -> None:
-    shown = [
-        {"robot": "a\x1b", "segment": 0, "points": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]},
-        {"robot": "b", "segment": 0, "points": [[5.0, 0.0, 0.0]]},
-        {"robot": "a\x1b", "segment": 1, "points": [[2.0, 0.0, 0.0]]},
-    ]
-
-    told = histories(shown)
-
-    assert set(told) == {r"a\x1b", "b"}
-    assert told[r"a\x1b"]["parts"] == [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[2.0, 0.0, 0.0]]]
-    assert told[r"a\x1b"]["robot"] == r"a\x1b"
 
 
 def test_answer_times_are_known_after_two_readings_that_nobody_asked_for(

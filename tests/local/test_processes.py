@@ -16,7 +16,6 @@ import pytest
 from rse_pf.local.processes import (
     ProcessMark,
     is_alive,
-    last_line,
     mark_of,
     remove_old_logs,
     rotate_long_logs,
@@ -105,36 +104,6 @@ signal.pause()
         assert is_alive(mark)
         send_signal(mark, signal.SIGKILL)
         assert wait_ended(mark, SOON_S)
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("first\nlast\n\n", "last"),
-        ("UsageError: no cheese\n  hint: buy some\n", "UsageError: no cheese"),
-        ("  hint: buy some\n", "hint: buy some"),
-        ("", ""),
-        ("x" * 9000, "x" * 300),
-    ],
-)
-def test_the_last_line_of_a_log_is_the_one_that_tells_most(tmp_path: Path, text: str, line: str) -> None:
-    (tmp_path / "log").write_text(text)
-
-    assert last_line(tmp_path / "log") == line
-
-
-def test_a_long_log_begins_anew_and_its_lines_stay_in_its_predecessor(tmp_path: Path) -> None:
-    long, short, other = (tmp_path / name for name in ("server-1.log", "server-2.log", "settings.json"))
-    long.write_text("old\n" * 100)
-    short.write_text("few\n")
-    other.write_text("x" * 1000)
-
-    assert rotate_long_logs(tmp_path, 100) == [long]
-
-    assert long.read_text() == ""
-    assert (tmp_path / "server-1.log.1").read_text() == "old\n" * 100
-    assert (short.read_text(), len(other.read_text())) == ("few\n", 1000)
-    assert rotate_long_logs(tmp_path, 100) == []
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o644])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -92,17 +91,6 @@ def test_the_images_that_robots_stored_for_a_live_map_are_taken_along(
     assert f"note: the store has no image of {missing} keyframe" in capsys.readouterr().out
 
 
-def test_json_names_the_files_and_what_the_user_should_know(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert export("hall", "occupancy", "plan", "--json") == 0
-
-    said = json.loads(capsys.readouterr().out)
-    assert said["files"] == ["plan/map.pgm", "plan/map.yaml"]
-    assert said["file"] == "plan"
-    assert any("--up names it" in note for note in said["notes"])
-
-
 def test_the_grid_takes_its_options(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = (
         "--resolution",
@@ -153,17 +141,6 @@ def test_what_cannot_be_written_is_one_line_with_a_hint(
     assert "hint:" in error
     assert len(error.splitlines()) == 2
     assert not Path("out").exists()
-
-
-def test_a_file_is_no_folder_and_a_folder_no_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("file").write_text("mine")
-    Path("folder").mkdir()
-
-    assert export("hall", "colmap", "file") == 2
-    assert "file is a file" in capsys.readouterr().err
-    assert export("hall", "ply", "folder") == 2
-    assert "folder is a folder" in capsys.readouterr().err
-    assert Path("file").read_text() == "mine"
 
 
 @pytest.mark.parametrize("kind", FORMATS)

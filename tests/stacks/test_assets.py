@@ -7,7 +7,6 @@ import importlib.util
 import json
 import os
 import shutil
-import sys
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -125,24 +124,6 @@ def test_an_instance_may_complete_the_hook_of_its_own_group_only(assembly: Any) 
     assert json.dumps(statement["Resource"]).rstrip('"}]').endswith(":autoScalingGroupName/rse-pf")
 
 
-def test_the_function_carries_the_bytecode_of_its_python_and_the_same_each_time(
-    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    builder = _builder(repository)
-    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    found = []
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "thing.py").write_text('"""Docs."""\nWORDS = {"x", "y", "z"}\n')
-        assert builder._compile(tmp_path / name, version, "/var/task")
-        (file,) = (tmp_path / name / "__pycache__").glob("thing.*.pyc")
-        found.append(file.read_bytes())
-
-    assert found[0] == found[1]
-    assert found[0][4] == 1, "Lambda does not compare it with the source (PEP 552)"
-    assert b"/var/task/thing.py" in found[0]
-
-
 def test_the_same_tree_gives_the_same_archive_whatever_its_times_and_owners(
     repository: Path, tmp_path: Path
 ) -> None:
@@ -165,19 +146,6 @@ def test_the_same_tree_gives_the_same_archive_whatever_its_times_and_owners(
     assert entries["bin/rse-pf"].mode == 0o755
     assert entries["bin/python"].linkname == "/usr/bin/python3"
     assert {(entry.uid, entry.gid, entry.mtime) for entry in entries.values()} == {(0, 0, 315532800)}
-
-
-def test_the_two_archives_of_libraries_hold_every_file_once_and_are_of_one_size(
-    repository: Path, tmp_path: Path
-) -> None:
-    for at in range(20):
-        (tmp_path / f"file-{at}").write_bytes(b"x" * (at * at + 1))
-
-    halves = _builder(repository)._halves(tmp_path)
-
-    assert sorted((*halves[0], *halves[1])) == sorted(tmp_path.iterdir())
-    sizes = [sum(file.stat().st_size for file in half) for half in halves]
-    assert abs(sizes[0] - sizes[1]) <= 0.1 * sum(sizes)
 
 
 def test_a_server_unpacks_what_the_builder_packs_where_it_was_compiled_for(repository: Path) -> None:

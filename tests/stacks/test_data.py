@@ -116,16 +116,6 @@ def _vpc(resources: dict[str, Any]) -> str:
     return name
 
 
-def test_the_units_let_owners_of_live_maps_listen_where_the_firewall_lets_servers_in(
-    assembly: Assembly,
-) -> None:
-    for unit in assembly.folder.glob("asset.*/rse-pf.service"):
-        (start,) = [line for line in unit.read_text().splitlines() if line.startswith("ExecStart=")]
-        assert "--live-host 0.0.0.0 " in start
-        return
-    pytest.fail("no package holds the unit")
-
-
 @pytest.mark.parametrize(
     ("groups", "has_ports"),
     [({}, True), ({"data": {"enabled": False}}, False), ({"live": {"max_owners": 0}}, False)],

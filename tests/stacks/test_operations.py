@@ -12,10 +12,7 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.money.costs import HOURS, bill_of, parked
-from rse_pf.aws.money.prices import load_prices
 from rse_pf.cli.main import main
-from rse_pf.config import PlatformSettings
 from tests.kit.emulated_aws import NoRoom
 
 REGION = "ap-northeast-2"
@@ -37,39 +34,6 @@ RUN_HERE = {
     "rse-pf cloud cost --robots 20 --fps 5 --burst 100000": 0,
 }
 """Each with its exit code on an account that has the Data stack and nothing else."""
-NEEDS_AN_ACCOUNT = {
-    "rse-pf cloud logs SERVER --lines 500",
-    "rse-pf cloud logs SERVER --console",
-    "aws autoscaling describe-scaling-activities --auto-scaling-group-name rse-pf --max-items 5",
-    "aws autoscaling terminate-instance-in-auto-scaling-group --instance-id SERVER"
-    " --no-should-decrement-desired-capacity",
-    "aws lambda get-function-configuration --function-name rse-pf-pnp --query LoggingConfig.LogGroup",
-    "aws lambda get-function-configuration --function-name rse-pf-canary --query LoggingConfig.LogGroup",
-    "aws logs tail GROUP --since 1h",
-    "rse-pf cloud up",
-    "rse-pf cloud resume",
-    "rse-pf cloud park",
-    "rse-pf cloud park --deep",
-    "rse-pf cloud down",
-    "rse-pf cloud down --delete-data",
-    "aws sns subscribe --topic-arn TOPIC --protocol email --notification-endpoint you@example.org",
-    "make assets",
-    "npx cdk diff",
-    "rse-pf cloud upgrade",
-    "aws ec2 get-console-output --latest --output text --instance-id INSTANCE",
-    "aws ssm get-parameter --region us-east-1 --name /rse-pf/data/maps --query Parameter.Value --output text",
-    "aws ssm get-parameter --region us-east-1 --name /rse-pf/data/artifacts --query Parameter.Value"
-    " --output text",
-    "aws s3 sync s3://HOME-MAPS/maps s3://REPLICA-MAPS/maps",
-    "aws s3 sync s3://HOME-ARTIFACTS/services s3://REPLICA-ARTIFACTS/services",
-    "aws s3 sync s3://HOME-ARTIFACTS/control s3://REPLICA-ARTIFACTS/control",
-    "aws s3 cp s3://HOME-ARTIFACTS/keys.json s3://REPLICA-ARTIFACTS/keys.json",
-    "rse-pf map show kitchen --all --store s3:BUCKET",
-    "rse-pf map rollback kitchen VERSION --store s3:BUCKET",
-    "aws s3api get-bucket-policy --bucket BUCKET",
-    "aws s3api list-object-versions --bucket BUCKET --prefix NAME",
-    "aws s3api copy-object --bucket BUCKET --key NAME --copy-source BUCKET/NAME?versionId=VERSION",
-}
 
 
 @pytest.fixture
@@ -84,13 +48,6 @@ def blocks(page: str) -> list[tuple[str, list[str]]]:
     found = re.findall(r"((?:[^\n]+\n)+)\n```\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     assert len(found) == page.count("```") // 2, "a block without a paragraph before it"
     return [(" ".join(before.lower().split()), block.splitlines()) for before, block in found]
-
-
-def test_every_command_is_run_here_or_marked_as_needing_an_account(page: str) -> None:
-    told = {command: MARK in before for before, commands in blocks(page) for command in commands}
-
-    assert {command for command, marked in told.items() if marked} == NEEDS_AN_ACCOUNT
-    assert {command for command, marked in told.items() if not marked} == set(RUN_HERE)
 
 
 class Formation:
@@ -141,25 +98,3 @@ def test_what_runs_here_runs_in_the_order_of_the_page(
         told = capsys.readouterr()
         assert code == RUN_HERE[command], f"{command}: {told.err}"
         assert "Traceback" not in told.err
-
-
-def test_the_amounts_on_the_page_are_those_of_the_prices(page: str) -> None:
-    words = " ".join(page.split())
-    bill = bill_of(PlatformSettings(), load_prices())
-    small = bill_of(PlatformSettings.from_dict({"cloud": {"profile": "small"}}), load_prices())
-
-    for amount, text in (
-        (bill.total, "A platform without any robot costs about **{:.0f} USD** a month."),
-        (parked(bill, deep=False).total, "Parked it costs about **{:.0f} USD**,"),
-        (parked(bill, deep=True).total, "and the endpoints, about **{:.0f} USD**."),
-        (small.total, "`cloud.profile` = `small` costs **{:.0f} USD** a month idle,"),
-        (parked(small, deep=True).total, "idle, and **{:.0f} USD** parked with `--deep`"),
-    ):
-        assert text.format(amount) in words
-    up, parked_ = bill.total / HOURS, parked(bill, deep=False).total / HOURS
-    assert f"up | {up:.2f} an hour" in words
-    assert f"parked | {parked_:.2f} an hour" in words
-    assert (
-        f"a night parked cost {9 * up + 15 * parked_:.2f}; if it stays up, 24 hours cost {24 * up:.2f}."
-        in words
-    )

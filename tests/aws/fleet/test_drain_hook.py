@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import boto3
-from botocore.stub import Stubber
-
 from rse_pf.audit.log import SYNC_S
 from rse_pf.aws.fleet.task import Phase
 from rse_pf.aws.fleet.tasks import lifecycle
@@ -91,17 +88,3 @@ def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
     )
 
     assert longest_s < DRAIN_S - 15.0
-
-
-def test_the_call_and_its_arguments_match_the_api_of_aws() -> None:
-    client = boto3.session.Session().client(
-        "autoscaling", region_name="ap-northeast-2", aws_access_key_id="a", aws_secret_access_key="b"
-    )
-    expected = {
-        "AutoScalingGroupName": "rse-pf", "LifecycleHookName": "drain",
-        "InstanceId": "i-0123456789abcdef0", "LifecycleActionResult": "CONTINUE",
-    }  # fmt: skip
-    with Stubber(client) as stub:
-        stub.add_response("complete_lifecycle_action", {}, expected)
-        assert leave(FakeMachine(runs=False), client)
-        stub.assert_no_pending_responses()

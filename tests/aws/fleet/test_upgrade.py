@@ -303,18 +303,6 @@ def test_a_refresh_that_has_not_started_is_not_taken_for_the_successful_one_befo
     assert told[1] == "running: 0 %"
 
 
-def test_a_refresh_that_waits_is_followed_and_no_second_one_started() -> None:
-    aws = with_an_earlier_refresh(FakeAws())
-    aws.interrupt_at = 1
-    with pytest.raises(Interrupted):
-        run(aws)
-
-    ended, told = run(aws)
-
-    assert told[0] == "a refresh runs already; following it"
-    assert (ended.version, aws.servers, len(aws.refreshes)) == ("2", ["2", "2", "2"], 2)
-
-
 def test_a_parked_fleet_gets_the_version_without_a_refresh() -> None:
     aws = FakeAws(servers=0)
 

@@ -104,19 +104,3 @@ def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -
     kept.put_bucket_tagging(Bucket="maps-of-a-stack", Tagging={"TagSet": [TAG]})
     assert list(list_living_stacks(account, NAMES)) == []
     assert [each.name for each in find_leftovers(account, NAMES)] == ["maps-of-a-stack"]
-
-
-@pytest.mark.parametrize("state", ["in-use", "available"])
-def test_a_volume_in_use_is_no_leftover(region: str, state: str) -> None:
-    account = open_account(region)
-    ec2 = account.client("ec2")
-    volume = ec2.create_volume(
-        AvailabilityZone=f"{region}a", Size=8,
-        TagSpecifications=[{"ResourceType": "volume", "Tags": [TAG]}],
-    )["VolumeId"]  # fmt: skip
-    if state == "in-use":
-        image = ec2.register_image(Name="image")["ImageId"]
-        (instance,) = ec2.run_instances(ImageId=image, MinCount=1, MaxCount=1)["Instances"]
-        ec2.attach_volume(VolumeId=volume, InstanceId=instance["InstanceId"], Device="/dev/sdf")
-
-    assert [each.name for each in find_leftovers(account, NAMES)] == ([] if state == "in-use" else [volume])

@@ -11,12 +11,6 @@ from rse_pf.aws.money.prices import load_prices, operators_prices
 from rse_pf.errors import ConfigurationError
 
 
-def test_our_prices_say_when_and_where_they_held_and_who_read_them() -> None:
-    prices = load_prices()
-
-    assert all((prices.as_of, prices.region, prices.currency, prices.source, prices.servers))
-
-
 @pytest.mark.parametrize(
     ("data", "problem"),
     [

@@ -92,27 +92,6 @@ def test_maps_of_one_tenant_are_restored_with_all_versions_elsewhere(
     assert "0 versions written" in run(capsys, "map restore acme.maps --tenant acme --name lab")
 
 
-def test_lost_versions_come_back_and_later_ones_stay(capsys: Capture, store: DirectoryStore) -> None:
-    maps = MapRegistry(store, "acme")
-    old = maps.head("hall")
-    run(capsys, "map backup acme.maps --tenant acme")
-    store.delete(maps.blob_name("attic", maps.head("attic")))
-    for info in list(store.list("maps/acme/attic/")):
-        store.delete(info.name)
-    newer = commit(store, "hall", 5)
-    before = contents(store)
-
-    problem = refused(capsys, "map restore acme.maps --tenant acme")
-    assert "maps exist and have another head: hall" in problem
-    assert "--overwrite" in problem
-    assert contents(store) == before
-    run(capsys, "map restore acme.maps --tenant acme --overwrite")
-
-    assert maps.head("hall").id == old.id
-    assert maps.data("hall", newer)
-    assert maps.data("attic")
-
-
 def test_maps_in_a_bucket_are_backed_up_and_restored(capsys: Capture, cloud: Any) -> None:
     bucket = S3Store(cloud, "maps")
     commit(bucket, "hall", 1)

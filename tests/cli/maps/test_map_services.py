@@ -53,17 +53,6 @@ def test_merge_makes_one_map_and_names_what_was_joined(
     assert any(edge.kind == "merge" for edge in version.edges)
 
 
-def test_maps_that_were_not_joined_are_named_and_the_exit_code_is_1(
-    store: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(store, "merge", "a", "b", "c", "--into", "hall", "--json") == 1
-
-    made = json.loads(capsys.readouterr().out)
-    assert made["joined"] == ["a", "b"]
-    assert [each["map"] for each in made["not_joined"]] == ["c"]
-    assert made["not_joined"][0]["reason"]
-
-
 SHIFT_PX = 16
 """The camera moves to the right by so many pixels, in front of a wall."""
 

@@ -141,18 +141,6 @@ def test_unblock_asks_every_server_for_what_is_named(capsys, ports, platform, wo
     assert [[line.split()[:2] for line in port.asked] for port in ports] == [[["POST", target]]] * 2
 
 
-def test_a_server_that_does_not_answer_is_named_and_the_others_are_shown(capsys, ports, platform):
-    ports[0].refuses(ALL)
-    ports[0].answer["silent_workers"] = 1
-    ports[1].answer = ["no", "answer"]
-
-    written = told(capsys, "status", code=1)
-
-    assert "pose" in written
-    assert "no answer from server-2" in written
-    assert "no answer from 1 workers of server-1" in written
-
-
 @pytest.mark.parametrize(
     ("status", "code", "word"),
     [(401, 2, "--control-token"), (404, 1, "earlier version"), (403, 1, "own machine"), (500, 1, "500")],

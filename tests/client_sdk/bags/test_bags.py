@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,8 @@ import pytest
 
 from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.bag import Bag
-from client_sdk.bags.bag_file import BrokenMessage
-from client_sdk.bags.images import ImageFormat, check_image, decode_colour
+from client_sdk.bags.images import decode_colour
 from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, POSE, TF, load_types
-from client_sdk.bags.poses import PoseTopic
 from client_sdk.datasets import open_dataset
 from rse_pf.geometry import Camera
 from tests.kit.recorded_bags import write_recording
@@ -128,36 +125,6 @@ def test_the_true_path_comes_from_tf_and_is_interpolated(tmp_path: Path) -> None
         )
 
 
-def test_a_jpeg_without_its_end_is_broken() -> None:
-    whole = np.frombuffer(b"\xff\xd8" + bytes(500) + b"\xff\xd9", np.uint8)
-    expected = ImageFormat(holds="colour", encoding="jpeg", frame="eye", size=None)
-
-    check_image(SimpleNamespace(data=whole), expected)
-    with pytest.raises(BrokenMessage):
-        check_image(SimpleNamespace(data=whole[:-1]), expected)
-
-
-def test_no_pose_is_made_up_between_two_that_are_far_apart() -> None:
-    poses = posed_at(0, 200_000_000, 400_000_001, 500_000_000)
-
-    path = poses.path([100_000_000, 300_000_000, 450_000_000])
-
-    assert path is not None
-    assert path.timestamps_s.tolist() == [0.1, 0.45]
-
-
-def posed_at(*stamps_ns: int) -> PoseTopic:
-    """Return poses at these times, all of them the identity."""
-    types = load_types(is_ros1=False).types
-    poses = PoseTopic()
-    for stamp_ns in stamps_ns:
-        turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        place = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
-        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, stamp_ns), "world")
-        poses.add(types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn)))
-    return poses
-
-
 def test_a_topic_of_poses_is_the_true_path_where_tf_does_not_move_the_camera(tmp_path: Path) -> None:
     def posed(w: BagWriter, messages: list[Message]) -> list[Message]:
         kept = [each for each in messages if each[1] != TF]
@@ -237,15 +204,6 @@ def test_a_depth_camera_beside_the_colours_is_registered_by_tf_static(tmp_path: 
     expected[20:24, 18:22] = 0.5
     expected[20:24, 24:28] = 0.0  # what stood behind it was not seen
     np.testing.assert_array_equal(found, expected)
-
-
-def test_open_dataset_takes_bags_and_shares_them(tmp_path: Path) -> None:
-    dataset = open_dataset(write_bag(tmp_path, "ros1"))
-
-    second = dataset.thinned(5.0).share(1, 2)
-    assert [frame.timestamp_s for frame in second] == [stamp_of(4) / 1e9]
-    assert dataset.truth is not None
-    assert any(note.startswith(f"depth: {DEPTH}") for note in dataset.notes)
 
 
 @pytest.mark.parametrize(

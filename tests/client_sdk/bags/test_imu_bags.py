@@ -12,12 +12,8 @@ import pytest
 from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.message_types import IMU, TF
 from client_sdk.datasets import open_dataset
-from client_sdk.rigs.intrinsics import Intrinsics
-from client_sdk.rigs.rectification import Rectification
-from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse
-from tests.client_sdk.bags.test_stereo_bags import CAMERA, raw_pair, true_rig
 from tests.kit.small_bags import (
     FRAMES,
     KINDS,
@@ -91,46 +87,6 @@ def test_tf_tells_where_the_camera_sits_in_the_frame_of_the_imu(tmp_path: Path) 
         np.testing.assert_allclose(bag.imu.model.T_imu_camera, inverse(T_CAMERA_IMU), atol=1e-12)
 
 
-def test_of_a_pair_it_is_the_rectified_left_camera(tmp_path: Path) -> None:
-    rig = true_rig("radial-tangential")
-
-    def pair(w: BagWriter) -> list[Message]:
-        return [place(w), *raw_pair(w, rig, with_p=True), *imu_messages(w)]
-
-    with open_bag(write_bag(tmp_path, make=pair)) as bag:
-        assert (bag.has_stereo, bag.imu is not None) == (True, True)
-        frame = list(bag)[1]
-
-    wanted = inverse(T_CAMERA_IMU) @ Rectification(*rig).T_body_camera
-    assert frame.imu is not None
-    np.testing.assert_allclose(frame.imu.model.T_imu_camera, wanted, atol=1e-9)
-
-
-def rig_with_imu(offset_s: float = 0.0) -> Rig:
-    left = RigCamera(
-        name="left", lens=Intrinsics(camera=CAMERA), T_body_camera=exp_se3(np.array([0, 0, 0.1, 0.4, 0, 0])),
-        time_offset_s=offset_s,
-    )  # fmt: skip
-    imu = RigImu(
-        T_body_imu=exp_se3(np.array([0.2, 0, 0, 0, 0.3, 0])), gyro_noise=2e-3, gyro_walk=3e-5,
-        accel_noise=4e-2, accel_walk=5e-3, rate_hz=100.0,
-    )  # fmt: skip
-    return Rig(cameras=(left,), imu=imu)
-
-
-def test_a_rig_of_the_user_tells_place_noise_and_delay(tmp_path: Path) -> None:
-    rig = rig_with_imu(offset_s=0.05)
-    assert rig.imu is not None
-    with open_bag(write_bag(tmp_path, make=drive), BagOptions(rig=rig)) as bag:
-        track = bag.imu
-
-    assert track is not None
-    assert (track.model.gyro_noise, track.model.accel_walk) == (2e-3, 5e-3)
-    wanted = inverse(rig.imu.T_body_imu) @ rig.left.T_body_camera
-    np.testing.assert_allclose(track.model.T_imu_camera, wanted, atol=1e-12)
-    assert track.timestamps_s[0] == pytest.approx((stamp_of(0) - STEP_NS) / 1e9 - 0.05)
-
-
 def test_samples_in_any_order_copies_and_broken_ones(tmp_path: Path) -> None:
     def shuffled(w: BagWriter, messages: list[Message]) -> list[Message]:
         rows = [row for row, each in enumerate(messages) if each[1] == IMU]
@@ -201,17 +157,3 @@ def test_an_imu_that_cannot_be_used_is_told_and_refused_if_it_is_named(
         open_bag(path, BagOptions(imu=IMU_TOPIC))
     with pytest.raises(UsageError, match=says):
         open_dataset(path, imu=True)
-
-
-def test_topics_of_half_an_imu_are_not_taken_by_themselves(tmp_path: Path) -> None:
-    def halves(w: BagWriter) -> list[Message]:
-        messages = [each for each in drive(w) if each[1] != IMU]
-        return [*messages, *imu_messages(w, topic="/camera/gyro/sample")]
-
-    path = write_bag(tmp_path, make=halves)
-    with open_bag(path) as bag:
-        assert bag.imu is None
-    with pytest.raises(UsageError, match="has no IMU"):
-        open_dataset(path, imu=True)
-    with open_bag(path, BagOptions(imu="/camera/gyro/sample")) as bag:
-        assert bag.imu is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.bags import BagKind, BagOptions, BagWriter, Lens, open_bag
+from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, TF
 from client_sdk.datasets import open_dataset
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rectification import Rectification
-from client_sdk.rigs.rig import Rig, RigCamera
+from client_sdk.rigs.rig import RigCamera
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse
 from tests.kit.small_bags import (
@@ -34,7 +33,6 @@ from tests.kit.small_bags import (
     raw_image,
     scene,
     stamp_of,
-    transforms,
     write_bag,
 )
 
@@ -152,44 +150,6 @@ def test_raw_pairs_are_rectified_as_those_of_a_rig(tmp_path: Path, model: str, w
     np.testing.assert_allclose(frame.stereo.gray, wanted.right(seen).gray, atol=1)
 
 
-def test_the_true_path_is_that_of_the_rectified_left_camera(tmp_path: Path) -> None:
-    rig = true_rig("radial-tangential")
-
-    def driven(w: BagWriter) -> list[Message]:
-        moved = [
-            ("/tf", TF, stamp_of(row), transforms(w, stamp_of(row), "world", "body", (0.1 * row, 0, 0)))
-            for row in range(FRAMES)
-        ]
-        return [*raw_pair(w, rig, with_p=False), *moved]
-
-    with open_bag(write_bag(tmp_path, make=driven)) as bag:
-        truth = bag.truth
-
-    assert truth is not None
-    T_left_rectified = Rectification(*rig).T_body_camera
-    assert not np.allclose(T_left_rectified[:3, :3], np.eye(3), atol=1e-3)
-    np.testing.assert_allclose(truth.T_world_camera[0], T_left_rectified, atol=1e-9)
-
-
-def test_a_rig_of_the_user_replaces_the_cameras_of_the_bag(tmp_path: Path) -> None:
-    def silent(_: BagWriter, messages: list[Message]) -> list[Message]:
-        return [each for each in messages if each[1] != CAMERA_INFO]
-
-    rig = Rig(cameras=true_rig("radial-tangential"))
-    path = write_bag(tmp_path, make=pair_messages, change=silent)
-    with open_bag(path, BagOptions(rig=rig)) as bag:
-        frame = bag.read(0)
-
-    assert frame.stereo is not None
-    assert frame.stereo.baseline_m == pytest.approx(Rectification(*rig.cameras).baseline_m)
-    with pytest.raises(UsageError, match="no camera_info for /rig/left/image_rect"):
-        open_bag(path)
-    with pytest.raises(UsageError, match="intrinsics are those of one camera"):
-        open_bag(path, BagOptions(lens=Lens(camera=CAMERA)))
-    with pytest.raises(UsageError, match="the rig has one camera"):
-        open_bag(path, BagOptions(rig=Rig(cameras=rig.cameras[:1])))
-
-
 def test_depth_is_taken_before_a_pair_unless_the_pair_is_wanted(tmp_path: Path) -> None:
     path = write_bag(tmp_path, make=lambda w: [*raw_frames(w), *pair_messages(w)])
 
@@ -227,15 +187,6 @@ def test_of_several_pairs_the_user_names_one(tmp_path: Path) -> None:
         assert bag.chosen.colour.name == others[0]
     with pytest.raises(UsageError, match="no pair of cameras, or several"):
         open_bag(path, BagOptions(use_stereo=True))
-
-
-def test_images_without_a_partner_are_left_out_and_counted(tmp_path: Path) -> None:
-    def lossy(_: BagWriter, messages: list[Message]) -> list[Message]:
-        return [each for each in messages if not (each[0] == RIGHT and each[2] == stamp_of(2))]
-
-    with open_bag(write_bag(tmp_path, make=pair_messages, change=lossy)) as bag:
-        assert [frame.timestamp_s for frame in bag] == [stamp_of(row) / 1e9 for row in (0, 1, 3, 4)]
-        assert re.search(r"1 left image of \d without a right one within 0.02 s", bag.log.doubts[0].sentence)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 
 from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from rse_pf.cli.main import main
 from rse_pf.errors import RsePfError, UsageError
 from tests.kit.small_bags import (
     COLOUR,
@@ -30,14 +29,15 @@ from tests.kit.small_bags import (
     write_bag,
 )
 
+
+def without(topic: str) -> Change:
+    return lambda _, messages: [each for each in messages if each[0] != topic]
+
+
 pytest.importorskip("cv2", reason="pip install 'rse-pf[bags]'")
 pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")
 
 Change = Callable[[BagWriter, list[Message]], list[Message]]
-
-
-def without(topic: str) -> Change:
-    return lambda _, messages: [each for each in messages if each[0] != topic]
 
 
 def replaced(topic: str, make: Callable[[BagWriter, int], object], kind: str = IMAGE) -> Change:
@@ -45,14 +45,6 @@ def replaced(topic: str, make: Callable[[BagWriter, int], object], kind: str = I
         return [(each[0], kind, each[2], make(w, each[2])) if each[0] == topic else each for each in messages]
 
     return change
-
-
-def test_a_bag_without_depth_names_the_topics_that_it_has(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, change=without(DEPTH))
-
-    with pytest.raises(UsageError, match=r"no depth; its topics: .*/image_raw \(Image bgr8\)") as raised:
-        open_bag(path)
-    assert "--no-depth" in raised.value.hint
 
 
 def test_a_bag_without_camera_info_asks_for_intrinsics(tmp_path: Path) -> None:
@@ -143,20 +135,6 @@ def test_a_camera_that_cannot_be_used_is_refused(
     assert "--intrinsics" in raised.value.hint
 
 
-def test_depth_of_another_size_without_a_transform_is_refused(tmp_path: Path) -> None:
-    def small(w: BagWriter, stamp: int) -> object:
-        return raw_image(w, stamp, np.full((24, 32), 900, np.uint16), "16UC1", frame="elsewhere")
-
-    path = write_bag(tmp_path, change=lambda w, messages: [
-        (each[0].replace("aligned_depth_to_color", "depth"), *each[1:])
-        for each in replaced(DEPTH, small)(w, messages)
-    ])  # fmt: skip
-
-    with pytest.raises(UsageError, match="is not registered to /camera/color/image_raw") as raised:
-        open_bag(path)
-    assert "tf_static" in raised.value.hint
-
-
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -222,16 +200,3 @@ def attack(path: Path, seeds: range) -> None:
         with contextlib.suppress(RsePfError), open_bag(path) as bag:
             for _ in bag:
                 pass
-
-
-def test_the_verb_says_in_two_lines_what_is_missing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_bag(tmp_path, change=without(DEPTH))
-
-    assert main(["map", "from-bag", str(path), "--out", str(tmp_path / "out")]) == 2
-
-    error = capsys.readouterr().err
-    assert error.startswith("UsageError: the bag has no depth; its topics: /camera")
-    assert len(error.splitlines()) == 2
-    assert not (tmp_path / "out").exists()

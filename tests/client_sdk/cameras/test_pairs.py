@@ -64,12 +64,6 @@ def test_a_folder_of_pairs_gives_all_of_them_in_order(tmp_path: Path) -> None:
     assert frames[0].stereo.baseline_m == pytest.approx(0.1)
 
 
-def test_one_camera_of_a_pair_can_be_taken(tmp_path: Path) -> None:
-    with open_camera(images(tmp_path), camera="left") as source:
-        assert not source.has_stereo
-        assert next(source).stereo is None
-
-
 @pytest.mark.parametrize("is_beside", [True, False])
 def test_videos_of_both_cameras_are_paired(tmp_path: Path, is_beside: bool) -> None:
     if is_beside:
@@ -84,23 +78,6 @@ def test_videos_of_both_cameras_are_paired(tmp_path: Path, is_beside: bool) -> N
     assert frames[3].stereo is not None
     assert int(frames[3].rgb[5, 5, 0]) == pytest.approx(100, abs=3)
     assert int(frames[3].stereo.gray[5, 5]) == pytest.approx(200, abs=3)
-
-
-def test_images_without_a_partner_are_left_out(tmp_path: Path) -> None:
-    folder = images(tmp_path)
-    whole = [frame.timestamp_s for frame in open_camera(folder)]
-    (folder / "right" / "3.png").unlink()
-    with open_camera(folder) as pairs:
-        assert [frame.timestamp_s for frame in pairs] == whole[:3] + whole[4:]
-    (doubt,) = pairs.log.doubts
-    assert doubt.sentence.endswith("left out, without a right image: 3.png")
-
-
-def test_images_of_another_size_are_one_line(tmp_path: Path) -> None:
-    folder = images(tmp_path)
-    cv2.imwrite(str(folder / "left" / "0.png"), np.zeros((48, 48), np.uint8))
-    with pytest.raises(UsageError, match=r"images of 48x48 px, .*rig.json is for 64x48 px"):
-        open_camera(folder)
 
 
 @pytest.mark.parametrize(

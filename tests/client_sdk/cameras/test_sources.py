@@ -16,7 +16,7 @@ import pytest
 
 from client_sdk.cameras import FrameSource, Intrinsics, open_camera, write_intrinsics
 from client_sdk.cameras.opencv_video import open_video
-from rse_pf.errors import MissingExtra, RsePfError, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -189,16 +189,6 @@ def test_opencv_is_silenced_where_its_version_has_the_function(
     assert levels == [0]
 
 
-def test_a_distorted_lens_is_straightened(tmp_path: Path) -> None:
-    bent = Intrinsics(camera=CAMERA, distortion=(-0.4, 0.1, 0.0, 0.0, 0.0))
-    path = video(tmp_path)
-
-    *_, straight = open_camera(path, intrinsics=bent)
-    *_, plain = open_camera(path, intrinsics=INTRINSICS)
-
-    assert not np.array_equal(straight.rgb, plain.rgb)
-
-
 def _of_another_size(folder: Path) -> None:
     camera = Camera(fx=60.0, fy=60.0, cx=40.0, cy=30.0, width=80, height=60)
     list(open_camera(video(folder), intrinsics=Intrinsics(camera=camera)))
@@ -270,13 +260,3 @@ def test_a_source_that_cannot_be_used_is_refused_in_one_line(
 
     assert refused.value.hint
     assert "\n" not in refused.value.message
-
-
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-
-    with pytest.raises(MissingExtra) as missing:
-        open_camera("realsense")
-
-    assert isinstance(missing.value, RsePfError)
-    assert "rse-pf[realsense]" in missing.value.hint

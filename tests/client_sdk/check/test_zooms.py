@@ -46,22 +46,3 @@ def test_a_focal_length_that_is_not_the_same_is_found_where_it_is_known(
     assert found is not None
     assert (found.kind, found.value) == (kind, pytest.approx(value, rel=0.02))
     assert judge_zooms(adjusted(zooms, 0.2), times_s, common).finding is None
-
-
-WANDERING = 0.04 * np.sin(np.linspace(0.0, 5.0, VIEWS))
-STAIRS = np.repeat([-0.06, 0.0, 0.06, 0.12], 5)
-
-
-@pytest.mark.parametrize(
-    ("zooms", "said"),
-    [(WANDERING, "parts of the drive say"), (STAIRS, "neither two cameras nor a lens that focuses")],
-)
-def test_a_focal_length_that_errors_of_depth_move_is_no_finding_and_this_is_said(
-    zooms: Array, said: str
-) -> None:
-    times_s = np.arange(VIEWS) / 2.0
-
-    judged = judge_zooms(adjusted(zooms, 0.001), times_s, adjusted(np.zeros(VIEWS), 0.001))
-
-    assert judged.finding is None
-    assert said in judged.cannot_tell[0].reason

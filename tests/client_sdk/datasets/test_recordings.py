@@ -170,19 +170,6 @@ def test_depth_in_the_wrong_unit_is_noticed(tmp_path: Path):
 # --- NYU Depth V2 -------------------------------------------------------------------------------
 
 
-def test_depth_is_registered_where_the_colour_camera_sees_it():
-    depth_m = np.zeros((480, 640), np.float32)
-    depth_m[238, 313] = 2.0
-
-    registered = nyu.register_depth(depth_m)
-
-    # Nearly on the depth camera's axis: x = -0.0002 + R[0,2] z - 0.0250 = -0.0338 and
-    # y = -0.0015 + 0.0073 + 0.0003 = 0.0061, so column 325.58 - 518.86 * 0.0338 / 2 = 316.8
-    # and row 253.74 + 519.47 * 0.0061 / 2 = 255.3
-    assert np.argwhere(registered > 0).tolist() == [[255, 317]]
-    assert registered[255, 317] == pytest.approx(1.999, abs=0.001)
-
-
 def test_the_nearer_of_two_surfaces_hides_the_other():
     depth_m = np.full((480, 640), 4.0, np.float32)
     depth_m[200:280, 280:360] = 1.0
@@ -258,18 +245,6 @@ def test_an_image_of_another_size_than_the_camera_is_refused(
     assert "intrinsics.json" in told.value.hint
 
 
-def test_intrinsics_that_are_named_count_before_those_of_the_folder(tmp_path: Path):
-    folder = write_tum(tmp_path / "x", [0.0])
-    own = json.loads((folder / "intrinsics.json").read_text())
-    named = tmp_path / "named.json"
-    named.write_text(json.dumps({**own, "fx": own["fx"] + 7, "depth_scale": 2 * own["depth_scale"]}))
-
-    before, after = open_dataset(folder), open_dataset(folder, intrinsics=named)
-
-    assert after.camera.fx == before.camera.fx + 7
-    assert np.array_equal(2 * next(iter(after)).depth_m, next(iter(before)).depth_m)
-
-
 def test_named_intrinsics_of_a_folder_with_depth_say_its_scale(tmp_path: Path):
     folder = write_tum(tmp_path / "x", [0.0])
     own = json.loads((folder / "intrinsics.json").read_text())
@@ -314,25 +289,3 @@ def test_assumed_intrinsics_are_told(tmp_path: Path):
     assert "depth_scale 5000" in note
 
     assert open_dataset(write_tum(tmp_path / "known", [0.0])).notes == ()
-
-
-def test_colour_images_without_depth_are_left_out_and_counted(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / "drive", [0.0, 0.1, 0.2, 0.3, 0.4])
-    lines = (folder / "depth.txt").read_text().splitlines()
-    (folder / "depth.txt").write_text("\n".join(lines[:-2]) + "\n")
-
-    dataset = open_dataset(folder)
-
-    assert len(dataset) == 3
-    assert dataset.log.doubts[0].sentence.startswith("2 of 5 colour images")
-
-
-def test_a_few_images_without_a_partner_are_a_note(tmp_path: Path) -> None:
-    folder = write_tum(tmp_path / "drive", [row / 10 for row in range(20)])
-    lines = (folder / "depth.txt").read_text().splitlines()
-    (folder / "depth.txt").write_text("\n".join(lines[:-1]) + "\n")
-
-    dataset = open_dataset(folder)
-
-    assert dataset.log.doubts == ()
-    assert any(note.startswith("1 of 20 colour images") for note in dataset.notes)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from client_sdk.commands.answer_types import PoseAnswer
-from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract
+from client_sdk.frontend import FrontEndOptions, PoseQuery, extract
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.attachments import encode_keyframe_points
 from rse_pf.errors import ConnectError, Forbidden
@@ -61,18 +61,6 @@ def test_points_lie_on_surfaces_and_not_between_them_and_have_their_colours() ->
     assert not ((v >= 39) & (v <= 60) & (u >= 99) & (u <= 120)).any()
     assert not np.isin(v, (79, 80, 159, 160)).any(), "beside an edge"
     assert np.array_equal(colours, frame.rgb[v, u])
-
-
-def test_near_points_are_thinned_to_one_for_each_centimetre() -> None:
-    frame = frame_at(0, depth=True)
-    near = Frame(timestamp_s=0.0, rgb=frame.rgb, depth_m=np.full_like(frame.depth_m, 0.4), camera=CAMERA)
-
-    data = encode_keyframe_points(near, NO_FEATURES, 12_000)
-
-    assert data is not None
-    points, _ = decode_points(data, CAMERA)
-    width_m, height_m = 0.4 * 320 / 500, 0.4 * 240 / 500
-    assert len(points) <= (width_m / 0.01 + 2) * (height_m / 0.01 + 2)
 
 
 async def test_each_keyframe_refers_to_points_that_the_robot_stores(robot: FakeLiveRobot) -> None:
@@ -168,20 +156,6 @@ async def test_an_image_is_stored_where_operator_and_robot_want_it(
     first = cv2.imdecode(np.frombuffer(objects.held[images[0].digest], np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(first[:, :, ::-1].astype(int) - frame_at(0, depth=True).rgb).mean() < 8.0
     assert {each.digest for each in images} == set(objects.held)
-
-
-async def test_keyframes_beyond_the_rate_limit_of_images_have_none(
-    robot: FakeLiveRobot,
-) -> None:
-    objects = Objects()
-    robot.has_images, robot.foreign_keyframes = True, 1
-    live = replace(QUICK, images_bytes_per_s=1_000.0, points=0)
-    mapper = LiveMapper(robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0)
-    async with mapper:
-        await drive(mapper, range(9))
-        await robot.until(lambda: mapper.keyframes_waiting == 0)
-        images = [decode_keyframe(request.keyframe).image for request in robot.kept]
-        assert [each is not None for each in images] == [True, False, False]
 
 
 async def test_a_store_function_that_raises_is_reported_and_called_again(

@@ -15,7 +15,7 @@ import pytest
 from client_sdk import connect
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
-from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
+from client_sdk.live import Correction, LiveMapper, LiveOptions
 from client_sdk.live.keyframe_queue import (
     KeyframeQueue,
     NumberOffset,
@@ -86,21 +86,6 @@ async def test_keyframes_have_the_strongest_features_wherever_they_are(robot: Fa
     by_robot = connect("ws://127.0.0.1:1/ws").live_map("lab")._mapper._options
     assert by_robot is not None
     assert not by_robot.is_spread
-
-
-async def test_the_robots_own_cloud_is_made_of_its_keyframes_only(robot: FakeLiveRobot) -> None:
-    async with live_map(robot) as mapper:
-        await drive(mapper, range(1))
-    of_one = len(mapper.map)
-    readings = mapper.map.add(frame_at(0, depth=True), np.eye(4))
-
-    async with live_map(robot) as mapper:
-        await drive(mapper, range(5))  # 4 steps are 12.8 cm: the last one is a keyframe
-    counts = len(mapper.map.points(min_readings=1)[0])
-
-    assert readings > 0
-    assert of_one > 0
-    assert of_one < counts < 2 * of_one
 
 
 @pytest.mark.parametrize("codec", ["json", "zlib", "bin"])
@@ -327,20 +312,6 @@ async def test_a_lost_robot_begins_a_segment_and_is_relocalised(robot: FakeLiveR
         await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
 
 
-async def test_relocalise_sends_the_next_keyframe_without_a_pause(robot: FakeLiveRobot) -> None:
-    robot.foreign_keyframes = 50
-    patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
-    async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
-        await drive(mapper, range(2))
-        await robot.until(lambda: "live-relocalise" in robot.asked)
-        await drive(mapper, range(2, 4))
-        await robot.until(lambda: len(robot.kept) == 4)
-        assert robot.asked.count("live-relocalise") == 1
-        mapper.relocalise()
-        await drive(mapper, range(4, 5))
-        await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
-
-
 async def test_a_covered_lens_begins_no_segment_and_tracking_continues_after_it(
     robot: FakeLiveRobot,
 ) -> None:
@@ -429,22 +400,6 @@ async def test_a_keyframe_waits_while_a_pose_query_is_open(robot: FakeLiveRobot)
         await tracking
 
     assert order[:2] == ["pose", "live-keyframe"]
-
-
-def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
-    loop = asyncio.new_event_loop()
-    robot = FakeLiveRobot()
-    try:
-        with BlockingLiveMapper(live_map(robot), loop.run_until_complete) as blocking:
-            blocking.track(frame_at(0, depth=True))
-            loop.run_until_complete(robot.until(lambda: len(robot.kept) == 1))
-            robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
-            corrections = blocking.corrections()
-            assert next(corrections).by == "map"
-            assert blocking.track(frame_at(1, depth=True)).corrected
-        assert list(corrections) == []  # they end with the live map
-    finally:
-        loop.close()
 
 
 def test_a_small_spool_opens_empty_and_a_damaged_one_is_refused(tmp_path: Path) -> None:

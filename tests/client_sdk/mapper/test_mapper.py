@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,16 +18,15 @@ from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapper import Mapper
 from client_sdk.monocular.scale import OdometryScale
-from client_sdk.point_map import read_ply
 from client_sdk.robot import Robot, connect
-from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import Busy, UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.kit.fake_live_map import solve
-from tests.kit.flat_world import STEP_M, foreign, frame_at, tracked
+from tests.kit.flat_world import STEP_M, frame_at, tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -174,39 +172,6 @@ def test_a_lost_camera_without_depth_is_found_again_where_it_was() -> None:
     assert "matches" in lost.reason
     assert found.status == "tracked"
     assert mapper.lost_frames == 1
-
-
-def test_a_second_place_without_depth_is_saved_as_a_separate_segment(tmp_path: Path) -> None:
-    mapper = Mapper(
-        ask=solve, scale=OdometryScale(first_m=0.2), monocular=MonocularOptions(segment_after=3)
-    )  # fmt: skip
-    drive(mapper, range(9), depth=False, odometry=True)
-
-    there = (foreign(frame_at(row, depth=False)) for row in range(12))
-    elsewhere = tracked(mapper, (replace(each, timestamp_s=1.0 + each.timestamp_s) for each in there))
-    report = mapper.save(tmp_path)
-
-    assert (elsewhere[-1].segment, elsewhere[-1].scale) == (1, "up to scale")
-    assert (report["segments_apart"], report["frames_apart"]) == (1, 12)
-    assert len(mapper.trajectory) == 9
-    assert mapper.trajectory.positions[:, 0] == pytest.approx(STEP_M * np.arange(9), abs=0.01)
-    assert len(read_trajectory(tmp_path / "trajectory-2.txt")) == 12
-    assert "up to scale" in (tmp_path / "trajectory-2.txt").read_text()
-    assert "up to scale" not in (tmp_path / "trajectory.txt").read_text()
-    assert len(read_ply(tmp_path / "map-2.ply")[0]) > 100
-
-
-def test_saves_files_that_other_programs_read(tmp_path: Path) -> None:
-    mapper = Mapper(ask=solve)
-    drive(mapper, range(3), depth=True)
-
-    mapper.save(tmp_path / "out")
-
-    assert len(read_ply(tmp_path / "out" / "map.ply")[0]) > 1000
-    assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 3
-    assert json.loads((tmp_path / "out" / "report.json").read_text())["frames"] == 3
-    with pytest.raises(UsageError, match="cannot write"):
-        mapper.save(tmp_path / "out" / "map.ply")
 
 
 @pytest.mark.slow

@@ -12,12 +12,10 @@ import pytest
 import client_sdk
 from client_sdk.commands.answer_types import Answer
 from client_sdk.mapper import Mapper
-from rse_pf.errors import UsageError
 from rse_pf.maps.format import decode_map
 from rse_pf.services.mapping.merge import MergeReply
 from tests.client_sdk.mapper.test_mapper import drive
 from tests.kit.fake_live_map import solve
-from tests.kit.flat_world import frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -38,17 +36,6 @@ def test_the_keyframes_of_a_drive_are_in_its_encoded_map() -> None:
     assert np.isfinite(last.points_camera).all(axis=1).sum() > 100
     assert len(last.points_camera) == len(last.pixels) == len(last.descriptors)
     assert len(version.points) > 1000
-
-
-@pytest.mark.parametrize(("robot", "depth"), [("", True), ("robot-1", False)])
-def test_without_keyframes_there_is_no_map_to_share(robot: str, depth: bool) -> None:
-    mapper = Mapper(ask=solve, keyframes_of=robot)
-    drive(mapper, range(3), depth=depth)
-
-    with pytest.raises(UsageError, match="no keyframe was kept") as refused:
-        mapper.encoded_map()
-
-    assert "keyframes_of" in refused.value.hint
 
 
 REPLY = MergeReply(
@@ -94,14 +81,3 @@ def test_maps_are_merged_by_their_digests_and_a_stored_reply_is_fetched(stores_r
 
     assert reply == REPLY
     assert parties.asked == {"maps": [{"object": "digest-3"}, {"object": "digest-5"}]}
-
-
-def test_a_frame_after_the_drive_changes_no_map_that_was_encoded() -> None:
-    mapper = Mapper(ask=solve, keyframes_of="robot-1")
-    drive(mapper, range(2), depth=True)
-    before = mapper.encoded_map()
-
-    asyncio.run(mapper.track(frame_at(8, depth=True)))
-
-    assert decode_map(before).keyframes[0].timestamp_s == 0.0
-    assert mapper.encoded_map() != before

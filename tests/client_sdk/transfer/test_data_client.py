@@ -139,11 +139,6 @@ def once(answer: Answer, method: str = "PATCH", after: int = 0) -> Script:
     return script
 
 
-def test_a_small_object_is_sent_in_one_request(service: FakeService, robot: TimedClient) -> None:
-    assert robot.client.upload(b"small") == hashlib.sha256(b"small").hexdigest()
-    assert [method for method, _ in service.asked] == ["PUT"]
-
-
 def test_a_large_object_is_sent_in_parts_of_the_servers_size(
     service: FakeService, robot: TimedClient
 ) -> None:
@@ -281,14 +276,6 @@ def test_a_platform_without_a_data_service_is_told_soon_and_with_a_hint(
 
     assert 2.0 < robot.now <= 5.0
     assert "--no-data" in raised.value.hint
-
-
-def test_a_retry_waits_as_long_as_the_server_asks(service: FakeService, robot: TimedClient) -> None:
-    service.script = once(failure(503, "busy", **{"Retry-After": "7"}), "PUT")
-
-    robot.client.upload(b"small")
-
-    assert robot.pauses == [7.0]
 
 
 def test_a_download_is_verified_and_resumed(service: FakeService, robot: TimedClient, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rse_pf.extensions.experiments.load.payloads import SolvedPayload, is_right,
 from rse_pf.extensions.experiments.load.run import report_of, table_of
 from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario
 from rse_pf.extensions.experiments.load.swarm import SwarmResult, records_of
-from rse_pf.extensions.experiments.load.swarm_process import ResultRows, plan_s
+from rse_pf.extensions.experiments.load.swarm_process import ResultRows
 from rse_pf.extensions.experiments.results.records import CommandRecord
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
@@ -30,16 +30,6 @@ def options(**changes: Any) -> LoadScenario:
 
 def payloads(**changes: Any) -> list[SolvedPayload]:
     return make_payloads(options(**changes), SessionSettings())
-
-
-def test_send_times_are_fixed_before_the_run_and_evenly_spread_over_the_robots() -> None:
-    robots = 100
-    phases = sorted(plan_s(options(), number, 0.0, 0) for number in range(robots))
-    assert phases[0] >= 0.0
-    assert phases[-1] < 0.2
-    assert max(np.diff(phases)) < 3 * 0.2 / robots
-    assert plan_s(options(), 7, 100.0, 10) - plan_s(options(), 7, 100.0, 9) == pytest.approx(0.2)
-    assert plan_s(options(join_every_s=20.0), 3, 0.0, 0) >= 60.0
 
 
 @pytest.mark.parametrize("codec_name", ["zlib", "json", "bin"])

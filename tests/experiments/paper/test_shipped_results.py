@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,6 @@ from rse_pf.extensions.experiments.results.rerun import rerun_arguments, rerun_f
 
 RESULTS = Path(__file__).resolve().parents[3] / "docs" / "results"
 FOLDERS = report_folders(RESULTS)
-
-
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_a_report_names_the_commit_on_its_page_too(folder: Path):
-    commit = read_report(folder)["environment"]["commit"]
-
-    assert re.fullmatch("[0-9a-f]{40}", commit), "run it in a checkout without changes"
-    assert f"Commit {commit}. " in (folder / "report.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

@@ -8,10 +8,8 @@ import sys
 import pytest
 
 from rse_pf.errors import MissingExtra
-from rse_pf.extensions.experiments.paper.latency import latency_figures
 from rse_pf.extensions.experiments.plots.figures import (
     draw_elasticity,
-    draw_latency,
     require_matplotlib,
 )
 from rse_pf.extensions.experiments.results.records import CommandRecord, Records, run_sample
@@ -79,13 +77,6 @@ def test_draws_elasticity_of_one_run_two_runs_and_an_empty_one(tmp_path, runs):
     draw_elasticity(tmp_path / "fig8.png", runs)
 
     assert is_drawn(tmp_path / "fig8.png")
-
-
-@pytest.mark.parametrize("records", [fleet(), EMPTY])
-def test_draws_latency_beside_the_paper_also_without_answers(tmp_path, records):
-    draw_latency(tmp_path / "latency.png", latency_figures(records), "a caption")
-
-    assert is_drawn(tmp_path / "latency.png")
 
 
 def test_a_missing_extra_is_named_before_anything_runs(monkeypatch):

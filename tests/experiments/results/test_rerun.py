@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
-from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_figures, rerun_plan
 
 WIFI = "wifi/first_answer_after_heal_s/p99"
@@ -40,11 +37,3 @@ def test_slack_allows_no_lost_command_and_no_missing_figure():
     assert missed(report(1.0), report(1.0, lost=1)) == ["wifi/commands/lost"]
     assert missed(report(1.0), report(None)) == [WIFI]
     assert missed(report(1.0), {"runs": {}}) == [WIFI, "wifi/commands/lost"]
-
-
-@pytest.mark.parametrize(
-    "plan", [{"slack": 0.5}, {"slack": "much"}, {"bars": {WIFI: "< 2"}}, {"bars": 7}, {"bars": {WIFI: 2.0}}]
-)
-def test_a_damaged_plan_is_one_line(plan: dict[str, Any]):
-    with pytest.raises(UsageError, match="short form in the report is damaged"):
-        rerun_figures(report(1.0, **plan), report(1.0))

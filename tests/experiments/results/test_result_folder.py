@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 from pathlib import Path
@@ -16,36 +15,7 @@ from rse_pf.extensions.experiments.load.run import run_swarm
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.results.result_folder import (
     commit_of,
-    finish_report,
-    fresh_folder,
 )
-
-
-def test_all_results_of_an_earlier_run_are_removed(tmp_path):
-    out = tmp_path / "out"
-    for part in ("kill", "stop"):
-        (out / part).mkdir(parents=True)
-        (out / part / "events.jsonl").write_text("")
-    for name in ("report.json", "report.md", "robustness.png"):
-        (out / name).write_text("old")
-
-    fresh_folder(out, ("report.*", "robustness.png", "kill", "stop"))
-
-    assert list(out.iterdir()) == []
-
-
-def test_a_report_names_machine_load_and_settings(tmp_path):
-    settings = PlatformSettings()
-
-    page = finish_report(tmp_path, {"experiment": "x"}, lambda report: "# x\n", settings, [0.1, 0.2, 0.3])
-
-    assert page == (tmp_path / "report.md").read_text() == "# x\n"
-
-    around = json.loads((tmp_path / "report.json").read_text())["environment"]
-    assert around["load_average"] == [0.1, 0.2, 0.3]
-    assert len(around["load_average_after"]) == 3
-    assert around["settings_digest"] == settings.digest()
-    assert "numpy" in around["versions"]
 
 
 def start_demo(out: Path) -> None:

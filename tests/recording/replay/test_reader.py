@@ -54,22 +54,6 @@ def test_an_earlier_message_that_ends_many_commands_is_a_failure_of_each(tmp_pat
     assert commands[0].answered_ns == commands[1].answered_ns
 
 
-def test_a_thumbnail_and_odometry_belong_to_the_command_that_was_sent_next(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    made.send(1, thumbnail=jpeg(), T_odom_camera=np.eye(4))
-    made.send(2)
-    made.send(3, robot=7, T_odom_camera=2 * np.eye(4))
-
-    with_both, later, other = open_recording(made.close()).commands()
-
-    assert with_both.thumbnail == jpeg()
-    assert with_both.odometry is not None
-    assert np.array_equal(with_both.odometry.T_odom_camera, np.eye(4))
-    assert later.odometry is None
-    assert other.thumbnail is None
-    assert other.odometry is not None
-
-
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_a_file_that_is_cut_off_is_read_up_to_its_last_whole_chunk(tmp_path: Path, share: float) -> None:
     made = Made(tmp_path / "a")

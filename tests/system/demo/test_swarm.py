@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import CommandFailed
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.load.swarm import Swarm
 from rse_pf.extensions.experiments.results.summary import summarise
@@ -75,19 +74,6 @@ async def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path)
         assert command.round_trip_ms == pytest.approx(1e3 * (command.answered - command.planned), abs=0.01)
         assert command.sent >= command.planned - 1e-3
     assert 0.0 < result.cpu_s < result.wall_s * 2
-
-
-async def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp_path: Path) -> None:
-    heard: list[Any] = []
-    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud, Swarm(
-        LoadScenario(robots=2), url=cloud.url, token_of=lambda robot: "no-token",
-        session=SETTINGS.session, on_event=heard.append,
-    ) as swarm:  # fmt: skip
-        await swarm.start()
-        with pytest.raises(CommandFailed, match="0 of 2 had joined"):
-            await swarm.wait_joined(2.0)
-    assert {event["code"] for event in heard if event["event"] == "join-failed"} == {"unauthorized"}
-    assert not any(process.name == "swarm" for process in multiprocessing.active_children())
 
 
 async def test_the_median_through_the_papers_link_is_little_more_than_its_delay(tmp_path: Path) -> None:
