@@ -84,7 +84,7 @@ def test_a_defect_is_one_internal_failure_that_tells_nothing(error: BaseExceptio
     assert len(seen) == 1
 
 
-def test_an_unknown_service_is_told_what_there_is() -> None:
+def test_an_unknown_service_is_answered_with_what_there_is() -> None:
     registry = registry_of(lambda request: request, "pnp")
 
     failure = dispatch(registry, Command(id=1, service="pmp"), ticking(0.0))

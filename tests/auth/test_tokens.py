@@ -256,7 +256,7 @@ def trusted(roster: Roster | None = None, denied: DenyList | None = None) -> Cou
     return Counting(KEYS._keys, roster=roster, denied=denied)
 
 
-def test_the_times_of_a_verified_token_are_judged_every_time():
+def test_the_times_of_a_verified_token_are_validated_every_time():
     keys, token = trusted(), issue(ttl_s=60.0)
     verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
 

@@ -103,7 +103,7 @@ def test_a_command_is_shown_with_its_evidence_and_on_a_page(
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_changed_answer_is_told_and_gives_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changed_answer_is_reported_and_gives_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = Made(tmp_path / "rec")
     made.send(1, codec="json")
     pose = {"T_camera_world": np.eye(4).ravel().tolist(), "inliers": [1], "rmse_px": 1.0}

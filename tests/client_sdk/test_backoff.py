@@ -106,7 +106,7 @@ def test_a_server_that_dies_is_dialled_again_within_a_second():
         assert _backoff(ConnectTimings(), Random(seed)).pause_s(50.0, ANSWERED) <= 0.1
 
 
-def test_robots_that_are_told_the_same_time_do_not_come_back_together():
+def test_robots_that_get_the_same_time_do_not_come_back_together():
     full = DialError(ConnectError("full"), retry_after_s=60.0)
     pauses = [_backoff(ConnectTimings(), Random(seed)).pause_s(0.0, full) for seed in range(100)]
 

@@ -131,7 +131,7 @@ def call_in_child(robot, pipe):
     robot.close()
 
 
-def test_a_child_of_a_fork_is_told_to_connect_itself_and_the_parent_goes_on(url):
+def test_a_child_of_a_fork_is_asked_to_connect_itself_and_the_parent_goes_on(url):
     fork = multiprocessing.get_context("fork")
     with client_sdk.connect_blocking(url) as robot, ThreadPoolExecutor(1) as threads:
         for _ in range(5):

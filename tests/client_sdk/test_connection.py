@@ -314,7 +314,7 @@ async def test_a_message_above_the_limit_costs_a_reconnect_and_no_command():
         assert (await ask(a_robot, 1, deadline_s=5)).reply == {"value": 1}
 
 
-async def test_another_robot_with_the_same_token_is_told_as_a_conflict_and_tried_again_later():
+async def test_another_robot_with_the_same_token_is_reported_as_a_conflict_and_tried_again_later():
     async with FakePlatform() as platform, robot(platform.url) as a_robot:
         platform.hold = True
         waiting = ask(a_robot, 1, deadline_s=10)

@@ -84,7 +84,7 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
         (ConnectionRefusedError(errno.ECONNREFUSED, "refused"), False),
     ],
 )
-def test_what_reaches_nobody_is_told_from_what_a_firewall_counts(error, is_unanswered):
+def test_what_reaches_nobody_is_distinguished_from_what_a_firewall_counts(error, is_unanswered):
     assert tcp_error("ws://host/ws", error).is_unanswered is is_unanswered
 
 
@@ -111,7 +111,7 @@ def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
 
 
 @pytest.mark.parametrize("time", [True, "1700000000", -1, 1e12, float("nan"), None])
-def test_a_time_that_is_none_is_not_believed(time):
+def test_a_time_that_is_none_is_not_trusted(time):
     body = refusal_body("unauthorized", "no", "", cause="cut-off", valid_from_s=time)
 
     assert http_status_error("ws://host/ws", 401, {}, body).valid_from_s is None

@@ -68,7 +68,7 @@ def test_a_useless_map_option_is_refused(bad: dict[str, float]):
         MapOptions(**bad)
 
 
-def test_a_cut_or_missing_ply_file_is_told_in_one_line(tmp_path: Path):
+def test_a_cut_or_missing_ply_file_is_reported_in_one_line(tmp_path: Path):
     write_ply(tmp_path / "map.ply", *random_points(5, 10))
     (tmp_path / "map.ply").write_bytes((tmp_path / "map.ply").read_bytes()[:-1])
     for name in ("map.ply", "none.ply"):

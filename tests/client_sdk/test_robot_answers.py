@@ -71,7 +71,7 @@ async def test_a_cancelled_call_is_forgotten_and_not_sent_again():
         assert robot.stats.unanswered == 0
 
 
-async def test_a_command_that_is_too_large_is_told_with_both_numbers_and_never_sent():
+async def test_a_command_that_is_too_large_is_reported_with_both_numbers_and_never_sent():
     async with FakePlatform() as platform, connect(platform, codec="json") as robot:
         with pytest.raises(LimitExceeded, match=r"\d+ bytes is above 262144"):
             await robot.call("echo", {"value": "x" * 300_000})

@@ -128,7 +128,7 @@ def test_rows_are_used_in_the_order_of_time(stamps_s: tuple[float, ...], rows: l
         (0, 33_333, "microseconds"), (0, 33_333_333, "nanoseconds"),
     ],
 )  # fmt: skip
-def test_units_of_time_are_told_apart(first: float, step: float, unit: str) -> None:
+def test_units_of_time_are_distinguished(first: float, step: float, unit: str) -> None:
     assert time_unit_s(np.arange(20, dtype=np.float64) * step + first)[0] == unit
 
 

@@ -48,7 +48,7 @@ def test_the_first_pose_in_node_is_the_identity(platform: ExamplePlatform, tmp_p
 @pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.skipif(not NODE.exists(), reason="no Node: make setup installs it")
-def test_a_wrong_token_and_a_platform_that_is_down_are_told_apart(platform: ExamplePlatform) -> None:
+def test_a_wrong_token_and_a_platform_that_is_down_are_distinguished(platform: ExamplePlatform) -> None:
     module = (REPOSITORY / "client_web" / "rse-pf.js").as_uri()
     program = (
         f"import {{ connect }} from {module!r};"

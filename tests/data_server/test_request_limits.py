@@ -35,7 +35,7 @@ def ask(gate: RequestLimits, robot: RobotId, now: float, cost: float = 1.0) -> N
     gate.end(begin(gate, robot, cost, now))
 
 
-def test_a_robot_beyond_its_rate_is_told_when_to_come_back_and_others_are_served() -> None:
+def test_a_robot_beyond_its_rate_gets_the_time_to_come_back_and_others_are_served() -> None:
     gate = admission()
     for _ in range(40):  # four seconds' worth may come at once
         ask(gate, ROBOT, now=0.0)

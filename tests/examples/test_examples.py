@@ -50,7 +50,7 @@ def test_ten_lines_print_a_pose(platform: ExamplePlatform) -> None:
     assert re.match(r"ok: \d+ inliers, by server-1\n\[\[", done.stdout)
 
 
-def test_a_wrong_file_is_told_without_a_traceback(platform: ExamplePlatform) -> None:
+def test_a_wrong_file_is_reported_without_a_traceback(platform: ExamplePlatform) -> None:
     done = platform.run(platform.command("ten_lines", **{"robot-1.enrolment": "none.enrolment"}))
 
     assert done.returncode == 1

@@ -96,7 +96,9 @@ class Page:
     ],
 )
 @pytest.mark.parametrize("headers", [{}, {"authorization": "Bearer guessed"}, {"cookie": "session=secret-1"}])
-def test_without_a_session_nothing_is_told_or_done(method: str, target: str, headers: dict[str, str]) -> None:
+def test_without_a_session_nothing_is_shown_or_done(
+    method: str, target: str, headers: dict[str, str]
+) -> None:
     page = Page()
     page.session()
 

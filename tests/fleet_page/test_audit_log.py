@@ -74,7 +74,7 @@ def entry(action: str, subject: str, actor: str = "server-1", **detail: Any) -> 
         ),
     ],
 )
-def test_an_entry_is_told_in_words_with_the_tenant_and_the_user(told: Entry, sentence: str) -> None:
+def test_an_entry_is_reported_in_words_with_the_tenant_and_the_user(told: Entry, sentence: str) -> None:
     assert audit_sentence("server-1", told) == sentence
 
 

@@ -62,7 +62,7 @@ def test_the_boxes_show_what_aws_knows_and_say_what_it_does_not() -> None:
     assert json.loads(json.dumps(told)) == told
 
 
-def test_an_alarm_and_a_missing_server_are_told_with_the_runbook() -> None:
+def test_an_alarm_and_a_missing_server_are_reported_with_the_runbook() -> None:
     alarmed = overview(HEALTHY, wanted=2, alarms={"silent": "ALARM"}, reasons={"silent": "no data\x1b"})
 
     told = cloud_document(alarmed, metrics((30.0,)), SETTINGS, time_s=NOW_S)["waiting"]
@@ -120,7 +120,7 @@ def problems_in(newest: dict[str, Any]) -> list[str]:
     return [name for name, is_there in found.items() if is_there]
 
 
-def test_credentials_that_expire_are_told_on_the_page_and_end_nothing() -> None:
+def test_credentials_that_expire_are_reported_on_the_page_and_end_nothing() -> None:
     told = told_by_a_feed(Refusing("ap-northeast-2"))
 
     refused = "AWS refuses autoscaling describe_auto_scaling_groups: ExpiredToken (sign in again)"

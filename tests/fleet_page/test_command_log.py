@@ -13,7 +13,7 @@ def line(**fields: Any) -> str:
     return json.dumps({"time": 1.0, "event": "command", "code": "no-consensus", **fields}) + "\n"
 
 
-def test_weak_and_failed_commands_are_told_and_others_are_not(tmp_path: Path) -> None:
+def test_weak_and_failed_commands_are_reported_and_others_are_not(tmp_path: Path) -> None:
     log = tmp_path / "server-1.log"
     log.write_text(
         line(robot="a", time=2.0)

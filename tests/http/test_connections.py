@@ -223,7 +223,7 @@ async def test_an_application_is_cancelled_when_its_client_is_gone_only_if_asked
     assert app.is_cancelled.is_set() == ends_with_client
 
 
-async def test_a_client_that_expects_it_is_told_to_go_on_before_its_body() -> None:
+async def test_a_client_that_expects_it_is_asked_to_go_on_before_its_body() -> None:
     async with line_to(Echo()) as line:
         await line.send(head(b"Expect: 100-continue", b"Content-Length: 2"))
         go_on = await asyncio.wait_for(line.reader.readuntil(b"\r\n\r\n"), SOON_S)

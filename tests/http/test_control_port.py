@@ -56,7 +56,7 @@ def test_requests_share_a_connection():
         b"GET /" + b"x" * 20000 + b" HTTP/1.1\r\n\r\n",
     ],
 )
-def test_garbage_is_never_answered_as_a_request(request_bytes):
+def test_malformed_input_is_never_answered_as_a_request(request_bytes):
     asked, got = talk(request_bytes)
 
     assert asked == []

@@ -139,7 +139,7 @@ def nested(depth: int, inmost: Any = None) -> Any:
 
 
 @pytest.mark.parametrize("inmost", [None, [], {}, [7] * 100, {"a": 1}])
-def test_the_depth_is_judged_on_the_bytes(inmost):
+def test_the_depth_is_validated_on_the_bytes(inmost):
     levels = WIDE.depth - (inmost is not None)
     fits = msgspec.msgpack.encode({"text": LONG, "deep": nested(levels - 1, inmost)})
     too_deep = msgspec.msgpack.encode({"text": LONG, "deep": nested(levels, inmost)})

@@ -95,5 +95,5 @@ def test_a_fork_that_must_not_begin_is_killed_with_the_reason_and_others_on_orde
 @pytest.mark.parametrize(
     ("code", "how"), [(0, "exit code 0"), (3, "exit code 3"), (-9, "signal SIGKILL"), (-40, "signal 40")]
 )
-def test_an_exit_code_is_told_in_words(code: int, how: str) -> None:
+def test_an_exit_code_is_reported_in_words(code: int, how: str) -> None:
     assert how_ended(code) == how

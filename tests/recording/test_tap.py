@@ -77,7 +77,7 @@ def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[in
     assert struct.unpack("<Q", lost.data) == (tap.dropped,)
 
 
-def test_a_recorder_that_died_is_told_once_and_everything_goes_on(pipe: tuple[int, int]):
+def test_a_recorder_that_died_is_reported_once_and_everything_goes_on(pipe: tuple[int, int]):
     loop, told = Loop(), list[str]()
     tap = RecordingTap(pipe[1], call_later=loop.call_later, on_dead=lambda: told.append("dead"))
     number = tap.open_connection("bin", ROBOT)

@@ -108,7 +108,7 @@ def test_a_command_that_was_read_and_its_answer_are_recorded_as_if_nothing_had_b
 @pytest.mark.parametrize(
     "payload", [{"note": "robot-seven"}, "robot-seven", None, [1.0], {"camera": "robot-seven"}]
 )
-def test_nothing_is_told_of_a_command_that_was_not_read_as_a_request(
+def test_nothing_is_reported_of_a_command_that_was_not_read_as_a_request(
     codec: str, payload: Any, pipe: tuple[int, int]
 ):
     told = handed(pipe, codec, Command(id=5, service="pnp", payload=payload))

@@ -107,7 +107,7 @@ def test_a_pair_has_the_baseline_of_both_camera_infos(is_ros1: bool) -> None:
     assert frame.timestamp_s == stamp_of(1) / 1e9
 
 
-def test_swapped_cameras_are_told_and_give_no_frame() -> None:
+def test_swapped_cameras_are_reported_and_give_no_frame() -> None:
     robot = StereoMessageStream()
     robot.infos(FX * BASELINE_M)
 

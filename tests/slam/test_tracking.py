@@ -394,7 +394,7 @@ def test_poses_are_right_within_the_simulated_noise(has_depth: bool, outliers: f
 
 
 @pytest.mark.parametrize("has_depth", [True, False])
-def test_a_motion_that_nothing_holds_is_told(has_depth: bool) -> None:
+def test_a_motion_that_nothing_holds_is_reported(has_depth: bool) -> None:
     for seed in range(20):
         for n in (0, 1, 2):
             observed, _, start = observations(seed, n=n, has_depth=has_depth)

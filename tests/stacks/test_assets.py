@@ -105,7 +105,7 @@ def test_the_template_vouches_for_the_package_it_names(assembly: Any) -> None:
         assert name in script
 
 
-def test_the_group_and_the_hook_are_those_that_an_instance_is_told(assembly: Any) -> None:
+def test_the_group_and_the_hook_are_those_that_an_instance_is_given(assembly: Any) -> None:
     assert assembly.one("AWS::AutoScaling::AutoScalingGroup")["AutoScalingGroupName"] == "rse-pf"
     hook = assembly.one("AWS::AutoScaling::LifecycleHook")
     assert hook["LifecycleHookName"] == "rse-pf-drain"

@@ -60,7 +60,7 @@ def test_the_limit_of_dials_is_that_of_the_robots_of_a_site(assembly: Any, templ
     assert dials.limit == settings.cloud.robots_per_site * of_a_robot
 
 
-def test_what_is_blocked_is_told_when_to_come_back_and_never_ends_a_robot(template: Any) -> None:
+def test_what_is_blocked_gets_the_time_to_come_back_and_never_ends_a_robot(template: Any) -> None:
     for rule in rules_of_template(template):
         rule.limit = 0
         reply = PlayedFirewall([rule]).judge(SITE, "/data/x" if rule.name == "data" else "/burst", 0.0)

@@ -102,7 +102,7 @@ NUMBERS = (
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_a_number_is_judged_and_read_alike(number: str) -> None:
+def test_a_number_is_validated_and_read_alike(number: str) -> None:
     assert_alike("json", command_of(f"1.25,{number},-3"))
     assert_alike("json", command_of(number))
 

@@ -86,7 +86,7 @@ def test_hello_is_answered_with_who_serves_and_what_it_accepts(codec: str) -> No
     assert server.state == "open"
 
 
-def test_another_protocol_version_is_told_so_and_closed() -> None:
+def test_another_protocol_version_is_refused_and_closed() -> None:
     server = session()
 
     failure, close = say(server, Hello(protocol=2))

@@ -133,7 +133,7 @@ def test_wherever_a_command_is_ended_the_same_command_finishes(
 
 
 @pytest.mark.slow
-def test_locked_audit_logs_stay_and_are_told_with_their_date(region: str) -> None:
+def test_locked_audit_logs_stay_and_are_reported_with_their_date(region: str) -> None:
     run(region, UP, Killer())
     s3 = account_of(region, Killer()).client("s3")
     where = {"LocationConstraint": region}

@@ -44,7 +44,7 @@ def erased(monkeypatch: pytest.MonkeyPatch, bucket: str, *, code: str, deploymen
     return erase_data(account, ResourceNames(deployment), audit_days=90)
 
 
-def test_audit_logs_that_are_locked_stay_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_audit_logs_that_are_locked_stay_and_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = erased(monkeypatch, "rsepf-data-auditlogs12ab-x1", code="AccessDenied")
 
     assert line == (

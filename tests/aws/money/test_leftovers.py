@@ -64,7 +64,7 @@ def test_each_kind_of_ours_is_found_and_nothing_of_others(region: str) -> None:
         assert each.why.startswith("kept on purpose") == (each.kind in ("bucket", "secret"))
 
 
-def test_a_bucket_that_cannot_be_looked_into_is_told_and_ends_nothing(
+def test_a_bucket_that_cannot_be_looked_into_is_reported_and_ends_nothing(
     region: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     account = open_account(region)

@@ -38,7 +38,7 @@ def test_a_bad_file_is_one_line_and_a_hint(tmp_path: Path, data: bytes, problem:
     assert "endpoint_per_hour" in caught.value.hint
 
 
-def test_prices_that_are_old_or_of_another_region_are_told_with_what_to_do() -> None:
+def test_prices_that_are_old_or_of_another_region_are_reported_with_what_to_do() -> None:
     ours = load_prices()
     day = date.fromisoformat(ours.as_of)
 

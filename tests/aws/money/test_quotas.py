@@ -74,7 +74,7 @@ def test_an_account_with_room_is_ready_and_every_complaint_has_a_fix(region: str
     assert all(bool(each.fix) == (each.grade != "ok") for each in found)
 
 
-def test_an_account_without_bootstrap_is_told_the_command(region: str) -> None:
+def test_an_account_without_bootstrap_gets_the_command(region: str) -> None:
     check = only("bootstrap", checks(region))
 
     assert (check.grade, check.fix) == ("fail", "rse-pf cloud up does it")

@@ -199,7 +199,7 @@ def test_a_presigned_url_fixes_name_length_and_digest(store: S3Store) -> None:
 @pytest.mark.parametrize(
     ("tier", "is_readable"), [("GLACIER_IR", True), ("STANDARD_IA", True), ("GLACIER", False)]
 )
-def test_an_object_in_an_archive_is_told_apart_from_a_refusal(
+def test_an_object_in_an_archive_is_distinguished_from_a_refusal(
     store: S3Store, region: str, tier: str, is_readable: bool
 ) -> None:
     make_client("s3", region).put_object(Bucket="maps", Key="maps/a", Body=b"map", StorageClass=tier)

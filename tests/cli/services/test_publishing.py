@@ -93,7 +93,7 @@ def test_nothing_runs_that_the_list_does_not_name_with_its_digest(cloud: Any, se
     assert server.look() == ["one", "two"]
 
 
-def test_a_server_that_does_not_run_yet_is_told_later(cloud: Any, server: Server) -> None:
+def test_a_server_that_does_not_run_yet_is_notified_later(cloud: Any, server: Server) -> None:
     assert main(["service", "new", "one", "--lang", "lua"]) == 0
     assert main(["service", "publish", "one"]) == 0
     server.machine.runs = False

@@ -144,7 +144,7 @@ def without_rates(w: BagWriter) -> list[Message]:
         (without_rates, "/imu/data has fewer than 2 samples"),
     ],
 )
-def test_an_imu_that_cannot_be_used_is_told_and_refused_if_it_is_named(
+def test_an_imu_that_cannot_be_used_is_reported_and_refused_if_it_is_named(
     tmp_path: Path, make: Callable[[BagWriter], list[Message]], says: str
 ) -> None:
     path = write_bag(tmp_path, make=make)

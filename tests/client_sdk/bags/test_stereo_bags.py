@@ -231,7 +231,7 @@ def test_raw_cameras_that_make_no_pair_are_refused(
     assert "--intrinsics" in raised.value.hint or "of one size and model" in raised.value.hint
 
 
-def test_a_right_camera_without_camera_info_is_told(tmp_path: Path) -> None:
+def test_a_right_camera_without_camera_info_is_reported(tmp_path: Path) -> None:
     def silent(_: BagWriter, messages: list[Message]) -> list[Message]:
         return [each for each in messages if each[0] != "/rig/right/camera_info"]
 

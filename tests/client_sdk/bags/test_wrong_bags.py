@@ -97,7 +97,7 @@ def test_compressed_images_that_are_cut_off_or_damaged_are_left_out(tmp_path: Pa
         assert bag.log.doubts[0].sentence.startswith("2 broken messages left out")
 
 
-def test_clocks_that_differ_are_told_with_the_smallest_difference(tmp_path: Path) -> None:
+def test_clocks_that_differ_are_reported_with_the_smallest_difference(tmp_path: Path) -> None:
     def late(w: BagWriter, messages: list[Message]) -> list[Message]:
         for topic, _, stamp, message in messages:
             if topic == DEPTH:
@@ -160,7 +160,7 @@ def files_of(path: Path) -> list[Path]:
 
 @pytest.mark.parametrize("kind", FIRST_KINDS)
 @pytest.mark.parametrize("share", [0.0, 0.6])
-def test_a_bag_that_was_cut_off_is_told_in_one_line(tmp_path: Path, kind: BagKind, share: float) -> None:
+def test_a_bag_that_was_cut_off_is_reported_in_one_line(tmp_path: Path, kind: BagKind, share: float) -> None:
     path = write_bag(tmp_path, kind)
     (file,) = files_of(path)
     data = file.read_bytes()

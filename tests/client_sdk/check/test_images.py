@@ -92,7 +92,7 @@ def test_an_uneven_rate_is_jitter_and_nothing_is_missing() -> None:
     assert found(images(), stamps).keys() == {FaultKind.JITTER}
 
 
-def test_of_frames_that_were_left_out_on_purpose_no_gap_is_told() -> None:
+def test_of_frames_that_were_left_out_on_purpose_no_gap_is_reported() -> None:
     statistics = FrameStatistics(is_thinned=True)
     for row, image in enumerate(images()):
         statistics.add((row + row // 2) / 30.0, image)

@@ -75,7 +75,7 @@ def test_metres_of_the_camera_are_wrong(scale: float) -> None:
     assert finding.is_certain
 
 
-def test_mirrored_images_are_told_from_swapped_axes() -> None:
+def test_mirrored_images_are_distinguished_from_swapped_axes() -> None:
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
 
     assert found(mirror @ tracked(stamps()) @ mirror).keys() == {FaultKind.MIRRORED}

@@ -50,7 +50,7 @@ def adjustment(offset_px: float, deviation_px: float = 0.02, keyframes: int = KE
 
 
 @pytest.mark.parametrize("offset_px", [0.3, -0.3])
-def test_an_offset_is_told_with_its_cost_and_what_to_set(offset_px: float) -> None:
+def test_an_offset_is_reported_with_its_cost_and_what_to_set(offset_px: float) -> None:
     judged = judge_pairs({0: adjustment(offset_px)})
 
     (finding,) = judged.findings
@@ -93,7 +93,7 @@ def kinds(report: CheckReport) -> set[FaultKind]:
 
 
 @pytest.mark.parametrize("share", [0.03, -0.03])
-def test_a_baseline_is_told_where_disparities_lack_nothing(share: float) -> None:
+def test_a_baseline_is_reported_where_disparities_lack_nothing(share: float) -> None:
     report = checked(1.0 + share, {0: adjustment(0.0)})
 
     assert kinds(report) == {FaultKind.BASELINE}

@@ -279,7 +279,7 @@ def test_a_unit_of_depth_that_is_assumed_has_narrow_limits(
         assert open_dataset(folder).has_depth
 
 
-def test_assumed_intrinsics_are_told(tmp_path: Path):
+def test_assumed_intrinsics_are_reported(tmp_path: Path):
     folder = write_tum(tmp_path / "mine", [0.0])
     for path in (folder / "rgb/0.png", folder / "depth/0.png"):
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), (640, 480)))

@@ -111,7 +111,7 @@ def test_a_camchain_of_kalibr_gives_the_right_camera_beside_the_left_one(
         assert (rig.imu.accel_walk, rig.imu.rate_hz, rig.left.time_offset_s) == (0.003, 200.0, 0.004)
 
 
-def test_intrinsics_alone_are_told_from_a_rig(tmp_path: Path) -> None:
+def test_intrinsics_alone_are_distinguished_from_a_rig(tmp_path: Path) -> None:
     path = tmp_path / "one.json"
     path.write_text('{"fx": 400, "fy": 401, "cx": 320, "cy": 240, "width": 640, "height": 480}')
 

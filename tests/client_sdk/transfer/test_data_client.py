@@ -266,7 +266,7 @@ def test_retries_end_at_the_deadline(service: FakeService, robot: TimedClient) -
     assert max(robot.pauses) <= 5.0
 
 
-def test_a_platform_without_a_data_service_is_told_soon_and_with_a_hint(
+def test_a_platform_without_a_data_service_is_reported_soon_and_with_a_hint(
     service: FakeService, robot: TimedClient
 ) -> None:
     service.script = lambda *_: (503, {}, b"no healthy upstream")  # of Envoy without targets

@@ -54,7 +54,7 @@ def test_the_objects_of_others_are_not_found_by_any_method(service: Service, ten
     assert after == before
 
 
-def test_a_thief_is_told_the_same_of_what_is_there_and_what_is_not(service: Service) -> None:
+def test_a_thief_gets_the_same_answer_for_what_is_there_and_what_is_not(service: Service) -> None:
     nowhere = hashlib.sha256(b"nobody has this").hexdigest()
 
     there = service.ask("GET", f"/data/v1/objects/{digest_of(1)}", robot="robot-2")

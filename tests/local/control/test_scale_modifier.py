@@ -106,7 +106,7 @@ def crashes(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, A
     return starts, told
 
 
-def test_a_crash_loop_gets_five_starts_a_minute_and_is_told_once() -> None:
+def test_a_crash_loop_gets_five_starts_a_minute_and_is_reported_once() -> None:
     starts, told = crashes(young=True, seconds=180)
 
     assert max(sum(0 <= later - start < 60.0 for later in starts) for start in starts) == 5

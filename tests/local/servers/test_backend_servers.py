@@ -55,7 +55,7 @@ def with_server(
     return answer, any(map(is_alive, marks.values()))
 
 
-def test_an_announcement_of_another_pid_is_not_believed(tmp_path: Path) -> None:
+def test_an_announcement_of_another_pid_is_not_trusted(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="announced pid"):
         with_server(tmp_path, FAKE % (1, ""), lambda made: made.wait_ready("server-1", SOON_S))
 

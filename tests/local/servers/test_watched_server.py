@@ -98,7 +98,7 @@ async def test_a_server_that_answers_nobody_is_ended_and_replaced(tmp_path: Path
     await box.servers.stop(10.0)
 
 
-async def test_a_server_that_ends_at_once_is_told_with_its_last_words(tmp_path: Path) -> None:
+async def test_a_server_that_ends_at_once_is_reported_with_its_last_words(tmp_path: Path) -> None:
     box = Box(tmp_path, "import sys; sys.exit('the disk is gone')")
 
     with pytest.raises(ConfigurationError, match=r"exit code 1.*the disk is gone"):

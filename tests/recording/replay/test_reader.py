@@ -146,7 +146,7 @@ def _wrong(tmp_path: Path, name: str) -> Path:
         ("bomb", LimitExceeded, "is above"),
     ],
 )
-def test_what_is_no_recording_is_told_in_one_line(
+def test_what_is_no_recording_is_reported_in_one_line(
     tmp_path: Path, name: str, kind: type[RsePfError], says: str
 ) -> None:
     with pytest.raises(kind, match=says) as error:

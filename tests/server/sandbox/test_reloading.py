@@ -170,7 +170,7 @@ def test_services_that_never_get_ready_are_given_up_and_a_newer_list_replaces_th
     assert parts.sandboxes.names == ("d",)
 
 
-def test_the_first_services_are_started_when_they_come_and_a_failure_of_the_start_is_told() -> None:
+def test_the_first_services_are_started_when_they_come_and_a_failure_of_the_start_is_reported() -> None:
     parts = Parts()
     assert parts.made == []
     assert parts.sandboxes.report().gauges["sandboxes"] == 0

@@ -293,7 +293,7 @@ async def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_
         assert [server.name for server in cloud.servers] == ["server-2"]
 
 
-async def test_a_server_that_is_told_to_leave_is_replaced_but_not_cut_off(tmp_path: Path) -> None:
+async def test_a_server_that_is_asked_to_leave_is_replaced_but_not_cut_off(tmp_path: Path) -> None:
     news = News()
     async with platform(tmp_path / "a", news) as cloud:
         async with asking(cloud) as tally:

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.system]
 SETTINGS = PlatformSettings.from_dict({"local": {"start_timeout_s": 60.0, "warm_standby": False}})
 
 
-async def test_one_identity_is_valid_in_both_regions_and_a_strangers_is_not(tmp_path: Path) -> None:
+async def test_one_identity_is_valid_in_both_regions_and_another_identity_is_not(tmp_path: Path) -> None:
     for name, seed in (("home", b"h" * 32), ("replica", b"h" * 32), ("stranger", b"s" * 32)):
         (tmp_path / name).mkdir(mode=0o700)
         ensure_key(tmp_path / name, seed=seed, key_id="key-1")

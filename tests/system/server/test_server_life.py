@@ -91,7 +91,7 @@ async def test_a_draining_server_is_not_ready_but_still_accepts(start_server):
     assert seen["state"] == "draining"
 
 
-async def test_a_robot_that_connects_during_a_drain_is_told_to_move_as_well(start_server):
+async def test_a_robot_that_connects_during_a_drain_is_asked_to_move_as_well(start_server):
     server = start_server()
 
     async with server.robot() as staying:

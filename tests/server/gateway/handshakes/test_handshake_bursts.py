@@ -56,7 +56,7 @@ def burst() -> Iterator[Burst]:
         yield Burst(stack, 50)
 
 
-def test_requests_that_come_with_their_sockets_are_judged_a_few_in_a_round(burst: Burst) -> None:
+def test_requests_that_come_with_their_sockets_are_validated_a_few_in_a_round(burst: Burst) -> None:
     for robot in burst.robots:
         robot.sendall(REQUEST)
     burst.take()

@@ -61,7 +61,7 @@ def test_five_frames_a_second_with_the_catch_up_of_a_long_cut_are_never_refused(
     assert all(rates.retry_after_ms(ROBOT, now) == 0 for now in sorted(live + caught_up))
 
 
-def test_a_robot_a_little_above_its_rate_is_told_when_to_try_again_and_never_cut_off():
+def test_a_robot_a_little_above_its_rate_gets_the_time_to_try_again_and_never_cut_off():
     verdicts = judged(RobotRates(LIMITS), per_s=25.0, seconds=120.0)
     refused = [retry_ms for retry_ms in verdicts if retry_ms]
 
