@@ -57,6 +57,7 @@ def option(*flags: str, default: Any = None, section: str = "", exclusive: str =
     """Return a field of a request that is read from the command line, by default as a positional argument.
 
     The annotation of the field gives the type of the value; ``bool`` is a flag that takes no value.
+    The module of the request must have ``from __future__ import annotations``.
 
     Args:
         flags: Names such as ``--out``; none for a positional argument, which has the name of the field.
@@ -86,8 +87,11 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse all words, and refuse what this parser does not know, also as the parser of an action."""
         words = list(sys.argv[1:] if args is None else args)
-        if self.default_action and (not words or words[0].startswith("-")) and words[:1] not in _HELP:
-            words = [self.default_action, *words]
+        first = words[0] if words else ""
+        skipped = 2 if first == "--settings" else int(first.startswith("--settings="))
+        rest = words[skipped:]
+        if self.default_action and (not rest or rest[0].startswith("-")) and rest[:1] not in _HELP:
+            words = [*words[:skipped], self.default_action, *rest]
         self.typed = words
         parsed, unknown = super().parse_known_args(words, namespace)
         if unknown:
@@ -190,10 +194,12 @@ def _add_options(parser: Parser, request: Any) -> None:
 
 def _add_option(group: Any, declared: Field[Any]) -> None:
     flags, keywords = declared.metadata["flags"], dict(declared.metadata["keywords"])
-    kind = re.match(r"(?:tuple\[)?(\w*)", str(declared.type))
-    converter = None if kind is None else _CONVERTERS.get(kind[1])
+    if not isinstance(declared.type, str):
+        raise TypeError(f"the module of the field {declared.name} has no postponed annotations")
+    kind = declared.type.removeprefix("tuple[").split(" |")[0].split(",")[0]
+    converter = _CONVERTERS.get(kind)
     default = list(declared.default) if isinstance(declared.default, tuple) else declared.default
-    if kind is not None and kind[1] == "bool" and "action" not in keywords:
+    if kind == "bool" and "action" not in keywords:
         default = bool(default)
         keywords["action"] = "store_false" if default else "store_true"
     elif converter is not None:

@@ -180,6 +180,8 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("local --burst 70000", USAGE, "--burst 70000 is not a port", "name one from 1 to 65535, or leave it out"),
     WrongInput("local --burst -1", USAGE, "--burst -1 is not a port", "name one from 1 to 65535, or leave it out"),
     WrongInput("local --lan 127.0.0.1", USAGE, "no address that another machine can connect to", "for example: --lan 192.168.1.20; ip"),
+    WrongInput("local --settings range.json status", USAGE, "scaling.busy_cpu_percent = 900.0 is above 100", "lower it in cdk.json"),
+    WrongInput("local --name x stop", USAGE, "rse-pf local start: unrecognized arguments: stop", "put it before the options"),
     WrongInput("local robots", USAGE, "is not running", "start it with: rse-pf local"),
     WrongInput("local roll", USAGE, "is not running", "start it with: rse-pf local"),
     WrongInput("local logs", USAGE, "no logs in", "start a platform with rse-pf local, or"),
