@@ -166,8 +166,10 @@ class Route:
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
-PHOTO_COST = 10.0
-_LIST_COST, _COMMIT_COST = 5.0, 20.0
+# Tokens that a request takes from the bucket of its robot, where it takes more than one.
+PHOTO_COST = 10.0  # a photo is decoded and matched
+_LIST_COST = 5.0  # a list reads many names of the store
+_COMMIT_COST = 20.0  # a commit reads a whole map
 _WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
 _IF_RANGE = Field(name="If-Range", place="header", doc="the ETag for which the range holds; else all bytes")

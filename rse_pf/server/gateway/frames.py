@@ -25,7 +25,13 @@ __all__ = [
     "SendPong",
 ]
 
-CONTINUATION, TEXT, BINARY, CLOSE, PING, PONG = 0, 1, 2, 8, 9, 10
+# Opcodes of frames: RFC 6455, 5.2.
+CONTINUATION = 0
+TEXT = 1
+BINARY = 2
+CLOSE = 8
+PING = 9
+PONG = 10
 
 CLOSE_NORMAL = 1000
 CLOSE_PROTOCOL_ERROR = 1002

@@ -50,7 +50,9 @@ MAX_JOB_S = 3600.0  # a job that runs longer is killed: the largest merge that i
 _POLL_SHARE = 0.5  # of the time between two renewals: a follower reads the record this often
 _KILL_AFTER_S = 0.6  # a cancelled job has this long to exit before it is killed
 _READ_BYTES = 1 << 18
-WAITING, STARTING = "waits for its turn", "starts"
+# What a job does, in its progress messages.
+WAITING = "waits for its turn"
+STARTING = "starts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,20 +39,34 @@ ISOLATION = ("namespaces", "root", "privileges", "seccomp")
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
-_CLONE_NEWNS, _CLONE_NEWUTS, _CLONE_NEWIPC = 0x00020000, 0x04000000, 0x08000000
-_CLONE_NEWUSER, _CLONE_NEWPID, _CLONE_NEWNET = 0x10000000, 0x20000000, 0x40000000
+# Flags of unshare(2), linux/sched.h.
+_CLONE_NEWNS = 0x00020000
+_CLONE_NEWUTS = 0x04000000
+_CLONE_NEWIPC = 0x08000000
+_CLONE_NEWUSER = 0x10000000
+_CLONE_NEWPID = 0x20000000
+_CLONE_NEWNET = 0x40000000
 _MOUNT_POINTS = tuple(map(Path, ("/mnt", "/media", "/srv", "/opt", "/tmp", "/run")))
-_MS_NOSUID, _MS_NODEV, _MS_BIND, _MS_REC, _MS_PRIVATE = 0x2, 0x4, 0x1000, 0x4000, 1 << 18
+# Flags of mount(2), linux/mount.h.
+_MS_NOSUID = 0x2
+_MS_NODEV = 0x4
+_MS_BIND = 0x1000
+_MS_REC = 0x4000
+_MS_PRIVATE = 1 << 18
 _MNT_DETACH = 2
 _AT_RECURSIVE = 0x8000
-_MOUNT_ATTR_RDONLY, _MOUNT_ATTR_NOSUID, _MOUNT_ATTR_NODEV = 0x1, 0x2, 0x4
+# Attributes of mount_setattr(2), linux/mount.h.
+_MOUNT_ATTR_RDONLY = 0x1
+_MOUNT_ATTR_NOSUID = 0x2
+_MOUNT_ATTR_NODEV = 0x4
 _SYS_MOUNT_SETATTR = 442
 _SYS_PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
 _SECCOMP_MODE_FILTER = 2
 _CAP_VERSION_3 = 0x20080522
-_LAST_CAP = 63
-_MAX_THREADS = 64
-_ROOT_INODES, _BYTES_PER_INODE = 4096, 4096
+_LAST_CAP = 63  # highest number of a capability that the kernel interface allows
+_MAX_THREADS = 64  # of one sandbox, so that a service cannot exhaust the process ids of the machine
+_ROOT_INODES = 4096  # files and folders of the root, most of which are mount points
+_BYTES_PER_INODE = 4096  # of the scratch folder, so that many small files take no further kernel memory
 
 
 class IsolationUnavailable(Exception):

@@ -112,11 +112,23 @@ _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _X32 = 0x40000000
 _FIRST_OF_LINUX_5_1 = 424
 """From here on, calls have the same number on every machine."""
-_ALLOW, _KILL, _ERRNO = 0x7FFF0000, 0x80000000, 0x00050000
-_EPERM, _ENOSYS = 1, 38
-_LOAD, _AND, _RETURN = 0x20, 0x54, 0x06
-_JUMP_EQUAL, _JUMP_AT_LEAST = 0x15, 0x35
-_NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
+# Results of a filter, linux/seccomp.h; an error number is added to _ERRNO.
+_ALLOW = 0x7FFF0000
+_KILL = 0x80000000
+_ERRNO = 0x00050000
+# Error numbers, errno.h.
+_EPERM = 1
+_ENOSYS = 38
+# Instructions of classic BPF, linux/bpf_common.h.
+_LOAD = 0x20
+_AND = 0x54
+_RETURN = 0x06
+_JUMP_EQUAL = 0x15
+_JUMP_AT_LEAST = 0x35
+# Offsets in struct seccomp_data, in bytes.
+_NUMBER_AT = 0
+_ARCHITECTURE_AT = 4
+_ARGUMENTS_AT = 16
 
 
 def allowed_calls(languages: Collection[str], machine: str) -> dict[str, int]:
