@@ -156,6 +156,20 @@ def open_maps(settings: PlatformSettings, tenant: str = "default") -> MapRegistr
     return MapRegistry(open_data_store(settings), tenant, max_bytes=max_bytes, on_change=record)
 
 
+def head_id(name: str, maps: MapRegistry) -> str | None:
+    """Return the id of the newest version of a map, None if there is no such map."""
+    try:
+        return maps.head(name).id
+    except NotFound:
+        return None
+
+
+def split_version(word: str) -> tuple[str, str]:
+    """Return the name and the version of ``MAP`` or ``MAP@VERSION``; the version is ``head`` by default."""
+    name, _, version = word.partition("@")
+    return name, version or "head"
+
+
 def map_name(name: str | None, out: Path) -> str:
     """Return the name of the map of a drive, by default that of its results; raises UsageError."""
     if name is None:
@@ -199,11 +213,9 @@ def keep_map(
     """
     maps = open_maps(settings, tenant)
     TenantAccount(open_data_store(settings), tenant, settings.data).reserve(len(data))
-    try:
-        parent = maps.head(name).id
-    except NotFound:
-        parent = None
-    version = maps.commit(name, data, parent=parent, author=author, created_s=time.time(), note="a drive")
+    version = maps.commit(
+        name, data, parent=head_id(name, maps), author=author, created_s=time.time(), note="a drive"
+    )
     return {"store": settings.data.store, "map": name, "map_version": version.id}
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from rse_pf.command_line.map_store import MapRequest
+from rse_pf.command_line.map_store import MapRequest, split_version
 from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
@@ -97,15 +97,15 @@ def _localise_frames(request: LocaliseRequest, maps: MapRegistry) -> int:
 
     features = load_features(request.features)
     plugin = None if features is None else FeaturesPlugin(features)
-    name, _, version = request.name.partition("@")
-    data = maps.data(name, version or "head")
+    name, version = split_version(request.name)
+    data = maps.data(name, version)
     with at_work(f"reading {request.name}"):
         version_map, index = open_map(data)
     frames = [each for word in request.frames for each in _frames(word, request.every)]
     found: list[dict[str, Any]] = []
     for each in frames:
         reply = locate(index, _view_of(each, version_map, request.camera, plugin))
-        found.append(_location_document(each.label, location_of(reply, version or "head")))
+        found.append(_location_document(each.label, location_of(reply, version)))
         if not request.json:
             show(_location_line(found[-1]))
     return _finish(request, found)

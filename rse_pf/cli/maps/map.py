@@ -40,11 +40,17 @@ from rse_pf.cli.maps.bags import FromBagRequest, ToBagRequest, export_bag, run_f
 from rse_pf.cli.maps.from_camera import FromCameraRequest, run_from_camera
 from rse_pf.cli.maps.live import LIVE_ACTIONS, run_publish
 from rse_pf.cli.maps.localise import LocaliseRequest, run_localise
-from rse_pf.command_line.map_store import MapRequest, StoreRequest, VersionRequest
+from rse_pf.command_line.map_store import (
+    MapRequest,
+    StoreRequest,
+    VersionRequest,
+    head_id,
+    split_version,
+)
 from rse_pf.command_line.merge_output import commit_merge, merge_progress
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import NotFound, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.command import ExportRequest, run_export
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, compare_versions
 from rse_pf.maps.removal import choose_superseded, count_freed_bytes
@@ -121,7 +127,7 @@ def _show(request: _ShowRequest, settings: PlatformSettings) -> None:
         _check_folder(request.png)
     maps = request.open_maps(settings)
     if request.all:
-        head = _id_of_head(request.name, maps)
+        head = head_id(request.name, maps)
         records = maps.versions(request.name)
         request.print(
             [{**_fields(record), "head": record.id == head} for record in records],
@@ -173,9 +179,9 @@ def _merge(request: _MergeRequest, settings: PlatformSettings) -> int:
     from rse_pf.services.mapping.merge import MergeRequest, merge_maps
 
     maps = request.open_maps(settings)
-    names = [_version_of(word) for word in request.names]
+    names = [split_version(word) for word in request.names]
     records = [maps.record(*each) for each in names]
-    parent = _id_of_head(request.into, maps)
+    parent = head_id(request.into, maps)
     wanted = MergeRequest(
         maps=[maps.data(name, record.id) for (name, _), record in zip(names, records, strict=True)]
     )
@@ -241,19 +247,6 @@ def _draw(png: Path, name: str, maps: MapRegistry, record: MapRecord) -> None:
     caption += f"{record.points:,} point{'s' * (record.points != 1)}"
     with at_work("drawing the map"):
         draw_map(png, version.points, version.colours, robots, caption)
-
-
-def _id_of_head(name: str, maps: MapRegistry) -> str | None:
-    try:
-        return maps.head(name).id
-    except NotFound:
-        return None
-
-
-def _version_of(word: str) -> tuple[str, str]:
-    """Return name and version of ``MAP`` or ``MAP@VERSION``."""
-    name, _, version = word.partition("@")
-    return name, version or "head"
 
 
 def _record_line(record: MapRecord) -> str:

@@ -17,16 +17,14 @@ import os
 import time
 from dataclasses import dataclass
 
-from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
 from rse_pf.command_line.extras import require
+from rse_pf.command_line.map_store import head_id, open_maps, split_version, with_store
 from rse_pf.command_line.merge_output import commit_merge, merge_progress
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import NotFound, UsageError
-from rse_pf.identity import RobotId
-from rse_pf.local.state import state_folder
-from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
+from rse_pf.errors import UsageError
+from rse_pf.maps.registry import MapOrigin
 from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
@@ -40,24 +38,15 @@ class CleanRequest:
     """The store whose unfinished parts are deleted."""
 
     store: str | None = option(
-        "--store", help="store of the maps: dir:PATH or s3:BUCKET (default: data.store)"
+        "--store",
+        help="store of the maps: dir:PATH or s3:BUCKET (default: data.store, or that of rse-pf local)",
     )
 
     def settings_with_store(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return the settings with the store of the request; raises UsageError."""
-        chosen = settings if self.store is None else settings.replace(data={"store": self.store})
-        if chosen.data.store == "memory:":
-            folder = state_folder("default", os.environ) / "objects"
-            raise UsageError(
-                "no store is named, and one in memory belongs to another process",
-                hint=f"name --store dir:PATH; that of rse-pf local is dir:{folder}",
-            )
+        """Return the settings with the store of the request, as workers find it; raises UsageError."""
+        chosen = with_store(self.store, settings)
         kind, _, path = chosen.data.store.partition(":")
-        if kind == "dir" and not os.path.isdir(path):
-            raise UsageError(f"there is no folder {path}", hint="name the store that holds the maps")
-        if kind == "dir":
-            chosen = chosen.replace(data={"store": f"dir:{os.path.abspath(path)}"})
-        return chosen
+        return chosen.replace(data={"store": f"dir:{os.path.abspath(path)}"}) if kind == "dir" else chosen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,17 +103,11 @@ def merge_in_parts(request: MergeInPartsRequest, settings: PlatformSettings) -> 
         LocalCluster(workers) if request.scheduler is None else RemoteCluster(request.scheduler)
     )
     store = open_data_store(settings)
-
-    def record(action: str, name: str, version: MapRecord) -> None:
-        subject = str(RobotId(request.tenant, name))
-        record_map_change(settings, action, subject, version=version.id, number=version.number)
-
-    maps = MapRegistry(
-        store, request.tenant, max_bytes=4 * settings.data.max_object_bytes, on_change=record
-    )  # fmt: skip
+    maps = open_maps(settings, request.tenant)
     options = MergeOptions(candidates=request.candidates)
-    inputs = [_object_of(word, maps) for word in request.names]
-    parent = _id_of_head(request.out, maps)
+    versions = map(split_version, request.names)
+    inputs = [maps.blob_name(name, maps.record(name, version)) for name, version in versions]
+    parent = head_id(request.out, maps)
     engine = DaskEngine(store, settings, cluster, on_event=lambda text: show(text, error=True))
     merge = BatchMerge(store, engine, settings, options=options, align_clouds=not request.no_icp)
     began = time.perf_counter()
@@ -165,19 +148,6 @@ def delete_parts(request: CleanRequest, settings: PlatformSettings) -> None:
     for name in names:
         store.delete(name)
     show(f"{counted(len(names), 'object')} deleted")
-
-
-def _object_of(word: str, maps: MapRegistry) -> str:
-    """Return the object of ``MAP`` or ``MAP@VERSION``."""
-    name, _, version = word.partition("@")
-    return maps.blob_name(name, maps.record(name, version or "head"))
-
-
-def _id_of_head(name: str, maps: MapRegistry) -> str | None:
-    try:
-        return maps.head(name).id
-    except NotFound:
-        return None
 
 
 _EXAMPLE = "rse-pf batch run merge robot-1 robot-2 --out kitchen --store dir:objects"

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rse_pf.command_line.options import Action, Parser, add_action, option, perform
+from rse_pf.command_line.sensors import SensorRequest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
@@ -38,7 +39,7 @@ _MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExperimentRequest:
+class ExperimentRequest(SensorRequest):
     """An experiment with its options, or the results of one that are verified."""
 
     kind: str = option(choices=KINDS, help="the experiment, or verify")
@@ -84,18 +85,6 @@ class ExperimentRequest:
         section="map and live",
         metavar="DIR",
         help="a recording (default: a rendered world)",
-    )
-    camera: str | None = option(
-        "--camera",
-        choices=("stereo", "left"),
-        section="map and live",
-        help="both cameras of a stereo rig, or the left one alone (default: both where there are two)",
-    )
-    imu: bool | None = option(
-        "--imu",
-        action=argparse.BooleanOptionalAction,
-        section="map and live",
-        help="use the IMU, or do not (default: where there is one)",
     )
     frames: int = option(
         "--frames",
