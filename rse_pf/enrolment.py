@@ -1,4 +1,4 @@
-"""One file that holds all a robot needs to connect: address, authority of the platform, and its own key.
+"""The enrolment file, with which a robot connects: address, authority of the platform, and its own key.
 
 An operator writes it with ``rse-pf robot enrol ROBOT --out FILE`` and carries it to the robot.  It contains a
 private key: it is created with mode 0600, and refused if others may read it.  JSON, one object:

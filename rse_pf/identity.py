@@ -1,7 +1,7 @@
-"""Who a robot is: tenant, name and enrolment, the only key under which anything of a robot is kept.
+"""The identity of a robot, which is its tenant, name and enrolment: the only key for data of a robot.
 
-Two tenants may have robots of one name, and a name that was removed and enrolled again belongs to another
-robot.  A dictionary, a lock, a path or a lease that knows a robot by its name alone mixes them up.
+Two tenants may have robots of the same name, and a name that was removed and enrolled again belongs to
+another robot.  A dictionary, lock, path or lease whose key is the name alone would mix them up.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How a service is written, registered and dispatched.
+"""Define, register and call services.
 
 A service is a function from one typed request to one typed reply; it has no ``self`` and therefore keeps no
-state.  Every command reaches it through `dispatch`, on a backend server, in the Lambda and on the robot
-itself.  Whatever a service raises becomes a `Failure`, which holds nothing of the traceback.
+state.  `dispatch` calls it for every command, on a backend server, in the Lambda and on the robot
+itself.  An exception of a service becomes a `Failure` without the traceback.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Registry:
     def __init__(self) -> None:
         self._services: dict[str, Service] = {}
         self.others: tuple[str, ...] = ()
-        """Services that this server runs elsewhere, in sandboxes; named to who asks for an unknown one."""
+        """Names of services that run in sandboxes; they are listed in the error of an unknown service."""
 
     def service(
         self,

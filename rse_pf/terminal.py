@@ -1,10 +1,10 @@
-"""Write text to a terminal, a page or a log, and escape what a robot may have hidden in it.
+"""Write text to a terminal, a page or a log, and escape hidden characters, which a robot may have sent.
 
 Names, notes, provenance, answers of services and messages of errors may come from a robot.  A control
 character in them would move the cursor, change the clipboard or forge a line; an override of the writing
 direction, or an invisible character, would make one name look like another.  Commands write only through
-`show`, and logs only through `json_line`, so that no caller has to know whose a text is.  Letters of every
-language stay as they are.
+`show`, and logs only through `json_line`, so that no caller has to know where a text comes from.  Letters of
+every language stay as they are.
 
 Source:
     The Unicode Standard 15, Sect. 4.5 (general categories) and 5.21 (characters that are ignored in display);
@@ -81,7 +81,7 @@ def show(*lines: str, error: bool = False) -> None:
 
 
 def show_page(text: str) -> None:
-    """Write a text of several lines, in which nothing of a robot ends a line, to standard output."""
+    """Write a text of several lines to standard output; no part that a robot sent may hold a line break."""
     show(*text.removesuffix("\n").split("\n"))
 
 
@@ -91,7 +91,7 @@ def show_json(value: Any, *, indent: int | None = None, sort_keys: bool = False)
 
 
 def show_error(error: RsePfError) -> None:
-    """Write what is wrong, and what to do, to standard error."""
+    """Write the message and the hint of *error* to standard error."""
     show(*error_lines(error), error=True)
 
 

@@ -45,7 +45,7 @@ a machine that fails loses the entries of 0.2 s at most."""
 _RETRY_S = 1.0
 """Time between two attempts to write to a disk that is full."""
 _GAP = "log.gap"
-"""Action of an entry that says how many entries were lost."""
+"""Action of an entry that reports the number of lost entries."""
 _MAX_FILE_BYTES = 16 << 20
 """A file that is longer is renamed before the next line; it exceeds this by one line at most."""
 _MAX_WAITING = 20_000
@@ -132,9 +132,9 @@ class AuditLog:
         self._wake.set()
 
     def flush(self) -> bool:
-        """Write what waits, and return whether all of it is on the disk; what is not goes on waiting.
+        """Write the waiting entries, and return whether all are on the disk; the others stay in memory.
 
-        Where only `fsync` fails, entries are written again, and may be in the log twice.
+        If only `fsync` fails, entries are written again, and may be in the log twice.
         """
         with self._writing:
             try:
@@ -162,7 +162,7 @@ class AuditLog:
         return is_written
 
     def _next_batch(self) -> list[Entry]:
-        """Return the entries that wait, and behind them one that says how many were lost, if any were."""
+        """Return the waiting entries, followed by one with the number of lost entries if there are any."""
         with self._buffer_lock:
             batch = list(self._waiting)
             if self._lost:

@@ -1,6 +1,6 @@
-"""What a refused request says about itself: for logs only, never for a decision.
+"""Read the unverified names in a refused token: for logs only, never for a decision.
 
-Nothing here was verified: anybody can write any name into a token.  Each value is bounded; logs escape it.
+Anybody can write any name into a token.  Each value has a bounded length; logs escape it.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def claimed_by(token: str, keys: KeySet | None = None) -> dict[str, str]:
     unknown for a key that is not enrolled.
 
     Args:
-        token: Names what is returned, each as far as it does.
-        keys: With the roster; None knows no robot's key.
+        token: The token of the request; a value that it lacks is not returned.
+        keys: The key set with the roster; None without one.
     """
     parts = token[:_MAX_TOKEN].split(".")
     if len(parts) != 3:
@@ -78,9 +78,9 @@ def source_address(peer: str, forwarded_for: str, trusted_proxies: int) -> str:
 
     Args:
         peer: The other end of the TCP connection.
-        forwarded_for: The ``x-forwarded-for`` headers, joined; each trusted proxy appended one entry, and
-            whatever stands before those may be a lie.  An entry that is no address is a lie, too.
-        trusted_proxies: How many proxies stand in front.
+        forwarded_for: The ``x-forwarded-for`` headers, joined.  Each trusted proxy appended one entry.  Those
+            before may be forged, and an entry that is no address is ignored.
+        trusted_proxies: Number of proxies between clients and this server that append an entry.
     """
     entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]
     address = entries[-trusted_proxies] if 0 < trusted_proxies <= len(entries) else peer

@@ -1,6 +1,6 @@
-"""Which web pages may speak with the platform: the rule for the header ``Origin`` that browsers send.
+"""Decide which web pages may use the platform, by the header ``Origin`` that browsers send.
 
-Only browsers send it, and no script can change it.  It never replaces a token; nothing is read or sent here.
+Only browsers send the header, and no script of a page can change it.  It does not replace a token.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ class Roster(_Value, frozen=True, kw_only=True):
         if count >= MAX_ROBOTS_OF_TENANT:
             raise UsageError(
                 f"tenant {robot.tenant!r} has {count} robots already, which is the limit",
-                hint="remove robots that are gone: rse-pf robot remove",
+                hint="remove unused robots: rse-pf robot remove",
             )
         for other in others:
             if other.tenant == robot.tenant and _shared_form(other.robot) == shared_form:

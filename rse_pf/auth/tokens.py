@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 ISSUER = "rse-pf"
-"""Issuer (iss) of every token; platforms tell each other apart by ``auth.audience``."""
+"""Issuer (iss) of every token; ``auth.audience`` distinguishes platforms."""
 _ALGORITHM = "EdDSA"
 _TYPE = "robot+jwt"
 _CHECKS = {
@@ -82,7 +82,7 @@ class Claims(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _SignedClaims(NamedTuple):
-    """What a token with a valid signature, issuer and audience says; nothing of it was judged by the time."""
+    """The claims of a token with a valid signature, issuer and audience; its times are not checked yet."""
 
     claims: Claims
     starts_s: float
@@ -90,7 +90,7 @@ class _SignedClaims(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProvenRefusal:
-    """Why a token is refused that was signed with the key of an enrolled robot; the robot may be told so.
+    """Why a token is refused that was signed with the key of an enrolled robot, which may learn the reason.
 
     ``off_s`` is how far the token's time is from the server's: ahead of it if it is not yet valid, behind it
     if it has expired.  ``valid_from_s`` is the Unix time from which tokens are accepted after a cut-off.
@@ -279,8 +279,8 @@ class KeySet:
     def remember(self, digest: bytes, signed: _SignedClaims, robot: RobotId) -> None:
         """Remember a token of *robot* that is valid now, instead of its former one.
 
-        A robot has one place, so that none can drive out the others; a stranger, whose tokens are not valid,
-        has none.  Another roster or deny list is another key set, which remembers nothing.
+        One token of each robot is remembered, so that a robot cannot displace others; invalid tokens are not
+        remembered.  Another roster or deny list is another key set, which remembers nothing.
         """
         former = self._digests.pop(robot, None)
         if former is None and len(self._digests) >= _MAX_REMEMBERED:

@@ -1,4 +1,4 @@
-"""Where an operator's decisions are stored beside the public keys, and how often servers load them.
+"""Store the enrolled and the denied robots next to the public keys, and load them in servers.
 
 `AccessControlStore` holds two objects, changed by compare-and-swap only: ``control/robots.json`` and
 ``control/deny.json``.  On one machine they lie in the folder of ``keys.json``, in a cloud in its bucket.
@@ -62,7 +62,7 @@ class AccessControlStore:
         self._change(DENY_NAME, DenyList, edit)
 
     def create_missing(self) -> None:
-        """Write empty objects where there are none, so that readers can tell "empty" from "forbidden"."""
+        """Write missing objects as empty ones, so that readers can distinguish "empty" from "forbidden"."""
         self.change_roster(lambda roster: roster)
         self.change_deny_list(lambda denied: denied)
 
@@ -80,7 +80,7 @@ class AccessControlStore:
             if kind is Roster and MAX_ROSTER_BYTES < len(changed) > len(data or b""):
                 raise UsageError(
                     f"a roster of {len(changed)} bytes is above {MAX_ROSTER_BYTES}",
-                    hint="remove robots that are gone, or give them fewer scopes: services:* and the like",
+                    hint="remove unused robots, or give them fewer scopes: services:* and the like",
                 )
             try:
                 if changed != data:
@@ -102,7 +102,7 @@ class TrustStore:
         """Store the path; nothing is read yet.
 
         Args:
-            keys_file: The JWKS; roster and deny list lie in the folder ``control`` beside it.
+            keys_file: The JWKS; roster and deny list are in the folder ``control`` next to it.
         """
         self.keys: KeySet | None = None
         self.snapshot = ""
@@ -143,7 +143,7 @@ class TrustStore:
         if self.problem or self.keys is None:
             raise ConfigurationError(
                 f"cannot read the keys, the roster or the deny list: {self.problem}",
-                hint=f"check {self._keys_file} and the folder control beside it",
+                hint=f"check {self._keys_file} and the folder control next to it",
             )
         return self.keys
 

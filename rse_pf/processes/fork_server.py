@@ -1,8 +1,8 @@
-"""A fork server: a child that imports once what its forks need, and forks, kills and reaps them on order.
+"""A fork server: a child process that imports modules once, and forks, kills and reaps processes on order.
 
-Orders and reports are JSON, one in a packet of its socket, beside which descriptors are passed.  A fork
-server works for one level of trust: each user starts its own, and that of sandboxes starts without the
-variables, keys and sockets of a server.
+Orders and reports are JSON, one in each packet of its socket, and may carry descriptors.  A fork
+server works for one level of trust: each user of this module starts its own, and that of sandboxes has no
+environment variables, keys and sockets of a server.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def send_order(server: Child, do: str, number: int, *descriptors: int) -> None:
 
 
 def read_packet(connection: socket.socket) -> tuple[Any, list[int]]:
-    """Return the next packet and the descriptors beside it, None at the end; raises BlockingIOError.
+    """Return the next packet and its descriptors, None at the end; raises BlockingIOError.
 
     A parent reads ``ready``, ``created`` with the ``pid`` and a descriptor of the process, and ``gone`` with
     how it ended and the CPU seconds that it took, each as an ``event``.
@@ -70,17 +70,17 @@ class ForkPlan:
     fork: Callable[[int, list[int]], int]
     """Forks process *number* with the descriptors of its order; returns its pid, 0 if it could not."""
     begin: Callable[[int, int], str] = lambda number, pid: ""
-    """Lets process *number* run, whose *pid* the parent knows; returns why it is to be killed, or ""."""
+    """Starts the work of process *number* after its *pid* was reported; returns why to kill it, or ""."""
     free: Callable[[int], str] = lambda number: ""
-    """Frees what process *number* had; returns why it ended, or "" if its exit code says that."""
+    """Frees the resources of process *number*; returns why it ended, or "" if its exit code shows that."""
     watch: Callable[[list[int]], tuple[dict[int, str], float]] | None = None
-    """Looks at all forks, by pid; returns why some are to be killed, and the seconds until the next look."""
+    """Checks all forks, by pid; returns why to kill some of them, and the seconds until the next check."""
     keeps_ended: bool = False
     """Whether a process that ended keeps its pid, and is reported, only when its end is ordered."""
 
 
 def serve_forks(parent: socket.socket, plan: ForkPlan, **ready: Any) -> None:
-    """Say that this process is ready, and follow the orders of *parent* until it is gone; end all forks."""
+    """Report that this process is ready, and follow the orders of *parent* until it exits; kill all forks."""
     _Forks(parent, plan).run(ready)
 
 
@@ -143,7 +143,7 @@ class _Forks:
         os.kill(pid, signal.SIGKILL)
 
     def _follow_order(self) -> bool:
-        """Follow one order; return False when the parent is gone."""
+        """Follow one order; return False when the parent has exited."""
         order, descriptors = read_packet(self._parent)
         if order is None:
             return False
@@ -192,5 +192,5 @@ class _Forks:
 
     def _report(self, handle: int | None = None, **message: Any) -> None:
         data = json.dumps(message).encode()
-        with suppress(OSError):  # the parent is gone, which the next poll shows
+        with suppress(OSError):  # the parent has exited, which the next poll shows
             socket.send_fds(self._parent, [data], [] if handle is None else [handle])

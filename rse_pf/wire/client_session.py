@@ -196,7 +196,7 @@ class ClientSession:
         self._sequence: dict[str, int] = {}
         self._delivered: dict[str, int] = {}
         self._busy_streams: dict[str, tuple[float, Failure]] = {}
-        """Until when a stream is held back, and the answer that said so; a new connection begins anew."""
+        """By stream, until when it is held back, and the busy answer; a new connection clears this."""
         self._retry_tokens = _RETRY_BURST
         self.subscriptions = ClientSubscriptions()
 
@@ -471,11 +471,11 @@ class ClientSession:
 
     def _busy_for_too_long(self, pending: _Pending, now: float) -> Failure | None:
         """Return the answer by which a waiting frame ends whose stream is held back past its deadline."""
-        until_s, told = self._busy_streams.get(pending.command.stream, (0.0, None))
-        if told is None or until_s < pending.deadline or until_s <= now:
+        until_s, busy = self._busy_streams.get(pending.command.stream, (0.0, None))
+        if busy is None or until_s < pending.deadline or until_s <= now:
             return None
         command, left_ms = pending.command, 1e3 * (until_s - now)
-        return msgspec.structs.replace(told, id=command.id, trace=command.trace, retry_after_ms=left_ms)
+        return msgspec.structs.replace(busy, id=command.id, trace=command.trace, retry_after_ms=left_ms)
 
     def _may_send(self, pending: _Pending, connection: ConnectionState, capacity: int, now: float) -> bool:
         """Return whether this command may be sent now; count it if it is held back."""

@@ -2,7 +2,7 @@
 
 A server under overload must refuse a command for much less than it costs to accept one.  A message whose
 envelope is not recognised is left to `Codec.decode_from_robot`; one that is recognised may still be invalid.
-A message that the codec refused is asked for its id only, from a bounded number of its first bytes.
+Of a message that the codec refused only the id is read, from a bounded number of its first bytes.
 """
 
 from __future__ import annotations

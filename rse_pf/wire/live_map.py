@@ -1,6 +1,6 @@
-"""What robots and live maps tell each other: the requests of the services ``live-*``, replies and updates.
+"""Messages between robots and live maps: requests of the services ``live-*``, replies and updates.
 
-``docs/protocol.md`` describes the same in words.  Poses are ``(4, 4)``, row-major, flat; a covariance holds
+``docs/protocol.md`` describes the same messages.  Poses are ``(4, 4)``, row-major, flat; a covariance holds
 the 21 numbers of the upper triangle, row after row, of the ``(6, 6)`` covariance of the twist (metres, then
 radians) on the left of its pose.
 """
@@ -71,7 +71,7 @@ class KeyframeRequest(_Value, frozen=True, kw_only=True):
     """``live-keyframe``: one keyframe of the robot that sends it.
 
     ``segment`` counts the robot's odometry frames, ``number`` its keyframes over all segments, both from 0.
-    ``keyframe`` is encoded as `rse_pf.slam.keyframe` says.
+    ``keyframe`` is encoded by `rse_pf.slam.keyframe`.
     """
 
     map: _MapName
@@ -88,7 +88,7 @@ class KeyframeKept(_Value, frozen=True, kw_only=True):
 
 
 class LiveRelocalise(_Value, frozen=True, kw_only=True):
-    """``live-relocalise``: where in the map is the camera of this keyframe, whatever its pose says?"""
+    """``live-relocalise``: find the pose of this keyframe in the map, without regard to the pose in it."""
 
     map: _MapName
     keyframe: bytes

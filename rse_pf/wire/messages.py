@@ -1,6 +1,6 @@
 """The messages of protocol version 1, as types.
 
-``docs/protocol.md`` describes the same in words; the golden messages check both.
+``docs/protocol.md`` describes the same messages; the golden messages check both.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=3.6e6)]
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", omit_defaults=True):
-    """Unknown fields are ignored, so that a newer side may say more."""
+    """Unknown fields are ignored, so that a newer side may send more of them."""
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -72,11 +72,11 @@ class Hello(_Message, frozen=True, kw_only=True, tag="hello"):
 
 
 class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
-    """Server, answer to Hello: who serves, and what it accepts.
+    """Server answers a Hello with its name and its limits.
 
-    ``token_s``: the socket ends in so many seconds, unless a fresh token comes first.  ``burst_url``: where
-    commands are answered by HTTP while the servers cannot, an address or a path at the robot's own address.
-    ``tenant`` and ``scopes`` are what the server takes the robot's token for; no scopes allow everything.
+    ``token_s``: seconds until the server closes the socket, unless a fresh token arrives before.
+    ``burst_url``: address that answers commands by HTTP while no server can, or a path at the address of the
+    servers.  ``tenant`` and ``scopes`` are those of the robot's token; an empty ``scopes`` allows everything.
     """
 
     server: str
@@ -92,9 +92,10 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
 
 
 class Command(_Message, frozen=True, kw_only=True, tag="command"):
-    """Robot asks a service.  ``payload`` takes its type when its service is known.
+    """Robot calls a service.  The service determines the type of ``payload``.
 
-    ``deadline_ms`` counts from arrival.  Within ``stream`` the newest ``seq`` wins, unless ``keep``.
+    ``deadline_ms`` counts from the arrival at the server.  A command with a newer ``seq`` replaces a waiting
+    one of the same ``stream``, unless ``keep`` is set.
     """
 
     id: Identifier
@@ -108,15 +109,15 @@ class Command(_Message, frozen=True, kw_only=True, tag="command"):
 
 
 class Cancel(_Message, frozen=True, kw_only=True, tag="cancel"):
-    """Robot takes back a command that reported progress; its answer may still come first."""
+    """Robot cancels a command that reported progress; the answer may arrive nevertheless."""
 
     id: Identifier
 
 
 class Progress(_Message, frozen=True, kw_only=True, tag="progress"):
-    """Server tells how far a long command is: the share *done* (0..1), and *what* was done last.
+    """Server reports the progress of a long command: the share *done* (0..1), and *what* was done last.
 
-    Only to robots whose Hello names the capability ``progress``; the first one says that it was taken.
+    It is sent to robots whose Hello names the capability ``progress``; the first one confirms the command.
     """
 
     id: int
@@ -127,8 +128,8 @@ class Progress(_Message, frozen=True, kw_only=True, tag="progress"):
 class Result(_Message, frozen=True, kw_only=True, tag="result"):
     """Server answers a command.  ``received_s`` and ``sent_s`` are readings of the server's clock.
 
-    ``object`` is the sha256 of a reply that is kept as an object; where it is too large for a message,
-    ``reply`` is left out.
+    ``object`` is the sha256 of a reply that is stored as an object; ``reply`` is absent if it is too large
+    for a message.
     """
 
     id: int
@@ -142,7 +143,7 @@ class Result(_Message, frozen=True, kw_only=True, tag="result"):
 
 
 class Failure(_Message, frozen=True, kw_only=True, tag="failure"):
-    """Server says why a command, or (without ``id``) a message or the session, failed."""
+    """Server reports why a command, or without ``id`` a message or the session, failed."""
 
     id: int | None = None
     code: str
@@ -161,13 +162,13 @@ class Move(_Message, frozen=True, kw_only=True, tag="move"):
 
 
 class Ping(_Message, frozen=True, kw_only=True, tag="ping"):
-    """Robot reads its clock.  ``sent_s`` is the first of four stamps."""
+    """Robot sends the time of its clock, ``sent_s``, the first of four time stamps."""
 
     sent_s: float
 
 
 class Pong(_Message, frozen=True, kw_only=True, tag="pong"):
-    """Server returns the robot's stamp and adds its own two; the robot reads the fourth."""
+    """Server returns the robot's time stamp with two of its own clock; the robot adds the fourth."""
 
     sent_s: float
     received_s: float
@@ -175,22 +176,22 @@ class Pong(_Message, frozen=True, kw_only=True, tag="pong"):
 
 
 class Renew(_Message, frozen=True, kw_only=True, tag="renew"):
-    """Robot shows a fresh token of its own, so that the socket outlives the one it was opened with."""
+    """Robot sends a fresh token, so that the socket stays open after the first token expires."""
 
     token: Annotated[str, msgspec.Meta(max_length=65536)]
 
 
 class Renewed(_Message, frozen=True, kw_only=True, tag="renewed"):
-    """Server took the fresh token: the socket ends in ``token_s`` seconds, counted from this answer."""
+    """Server accepted the fresh token, which expires ``token_s`` seconds after this message."""
 
     token_s: float
 
 
 class Subscribe(_Message, frozen=True, kw_only=True, tag="subscribe"):
-    """Robot wants the updates of a topic, from its present state on.
+    """Robot subscribes to a topic, and first receives its present state.
 
-    Only from robots whose Hello names the capability ``updates``.  A refusal is a Failure with this ``id``,
-    which no command of the robot has.
+    Only robots whose Hello names the capability ``updates`` may subscribe.  No command of the robot has this
+    ``id``; a refusal is a Failure with it.
     """
 
     id: Identifier
@@ -198,16 +199,16 @@ class Subscribe(_Message, frozen=True, kw_only=True, tag="subscribe"):
 
 
 class Unsubscribe(_Message, frozen=True, kw_only=True, tag="unsubscribe"):
-    """Robot wants no more updates of this subscription; one that is on its way may still come."""
+    """Robot ends a subscription; an update that was sent before may still arrive."""
 
     id: Identifier
 
 
 class Update(_Message, frozen=True, kw_only=True, tag="update"):
-    """Server tells the newest value of one *key* of a topic; older values of the key are void.
+    """Server sends the newest value of one *key* of a topic, which replaces older values of the key.
 
-    ``seq`` counts all values of the subscription from 1, so that a gap says how many were replaced by newer
-    ones before they could be sent.
+    ``seq`` counts all values of the subscription from 1; a gap is the number of values that newer ones
+    replaced before they were sent.
     """
 
     id: int

@@ -1,7 +1,7 @@
-"""The HTTP answer of a server that refuses a handshake, and the mark by which a robot knows that it is ours.
+"""The HTTP reply of a server that refuses a handshake, and the member by which a robot recognises it.
 
-Firewalls, load balancers and login pages answer with 401 and 403, too.  A robot that took theirs for one of
-ours would believe for a while that its token is wrong, when somebody else answered.
+Firewalls, load balancers and login pages answer with 401 and 403, too.  Without this member a robot would
+take their replies for refusals of its token.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ PLATFORM = "rse-pf"
 """Value of the member ``platform`` in the body of each refusal."""
 CUT_OFF = "cut-off"
 """The cause of a token that was issued before the time from which those of its robot are accepted."""
-_MAX_BODY_BYTES = 4096
-_MAX_TEXT = 300
-_MAX_UNIX_S = 1e11
+_MAX_BODY_BYTES = 4096  # a longer body is none of ours
+_MAX_TEXT_CHARACTERS = 300  # of the message and the hint, which are shown to a user
+_MAX_UNIX_S = 1e11  # beyond the year 5000: no time of a cut-off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefusedHandshake:
-    """What a server said.
+    """The reason of a server.
 
-    ``cause`` is empty unless the token was signed with the key of an enrolled robot; ``valid_from_s`` (Unix
-    seconds of the server) is the time from which tokens are accepted after a cut-off.
+    ``cause`` is empty unless the token was signed with the key of an enrolled robot.  ``valid_from_s`` is the
+    time from which tokens are accepted after a cut-off, in Unix seconds of the server.
     """
 
     message: str
@@ -60,7 +60,7 @@ def refusal_in(body: bytes, code: str) -> RefusedHandshake | None:
 
 
 def _text(value: object) -> str:
-    text = value[:_MAX_TEXT] if isinstance(value, str) else ""
+    text = value[:_MAX_TEXT_CHARACTERS] if isinstance(value, str) else ""
     return text if text.isprintable() else ""
 
 

@@ -86,8 +86,8 @@ CLOSE_REPLACED = 4409
 CLOSE_RATE = 4429
 MAX_BAD_MESSAGES = 10
 """Undecodable messages without a readable id after which robot and server close the socket."""
-# An undecodable message counts once more for so many bytes.
 _BAD_MESSAGE_BYTES = 65_536
+"""An undecodable message counts once, and once more for each of these bytes: longer ones cost more."""
 
 
 class Send(msgspec.Struct, frozen=True, gc=False):
@@ -97,7 +97,7 @@ class Send(msgspec.Struct, frozen=True, gc=False):
 
 
 class SendRefusal(Send, frozen=True, gc=False):
-    """Write this WebSocket message, which says why a message was refused undecoded."""
+    """Write this WebSocket message, which refuses a message that cannot be decoded."""
 
     failure: Failure
 
@@ -231,7 +231,7 @@ class ServerSession:
     def answer_renewal(self, token_s: float | None) -> Send:
         """Answer a `Renewal`: the connection lasts *token_s* longer, or (None) the token was refused.
 
-        A refusal tells no cause, as in the handshake, and the connection keeps its previous expiry.
+        A refusal has no cause, as in the handshake, and the connection keeps its previous expiry.
         """
         if token_s is not None:
             return self._send(Renewed(token_s=token_s))
@@ -241,12 +241,12 @@ class ServerSession:
         return self._send(self._failure(error))
 
     def refuse_updates(self, identity: int, error: RsePfError) -> Send:
-        """End the subscription *identity* because of *error*, and return the message that says so."""
+        """End the subscription *identity* because of *error*, and return the message that reports it."""
         self.topics.pop(identity, None)
         return self._send(self._failure(error, identity=identity))
 
     def _subscribe(self, message: Subscribe) -> list[Decision]:
-        """Begin one more subscription; one of the same id ends, as after a robot lost count."""
+        """Begin a subscription; an earlier one with the same id ends."""
         if not self.hears_updates:
             unheard = BadRequest(
                 f"this connection did not announce the capability {UPDATES}", hint="name it in hello"
@@ -336,8 +336,8 @@ class ServerSession:
     def _refuse_undecoded(self, error: ProtocolError, data: bytes) -> list[Decision]:
         """Answer a message that cannot be decoded, as the answer to its command where its id can be read.
 
-        A client sends such a command by mistake of its program, which is told.  Without an id it is the
-        client that is broken, so that the connection ends after some.
+        With an id the program of the robot made a mistake, and gets the error.  Without an id the client
+        itself is broken, so the connection is closed after `MAX_BAD_MESSAGES`.
         """
         identity = undecodable_id(self.codec, data) if self.state == "open" else None
         failure = self._failure(error, identity=identity)
