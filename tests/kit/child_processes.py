@@ -38,7 +38,7 @@ def stay(parent: socket.socket) -> None:
 
 def nest(parent: socket.socket) -> None:
     """Start a child that stays, tell its pid, and wait."""
-    started = start_child(ChildPlan(target="tests.child.told_children:stay", name="a grandchild"))
+    started = start_child(ChildPlan(target="tests.kit.child_processes:stay", name="a grandchild"))
     receive(started.connection)
     parent.sendall(encode_message(started.pid))
     receive(parent)

@@ -22,7 +22,7 @@ WITHIN_S = 20.0
 @contextmanager
 def child(target: str = "tell", environment: dict[str, str] | None = None, **plan: Any) -> Iterator[Child]:
     started = start_child(
-        ChildPlan(target=f"tests.child.told_children:{target}", name="a child", **plan),
+        ChildPlan(target=f"tests.kit.child_processes:{target}", name="a child", **plan),
         environment=environment,
     )
     try:
@@ -69,7 +69,7 @@ def test_the_signals_of_a_terminal_are_ignored_and_the_end_of_the_socket_ends_a_
 
 
 def test_a_fork_that_must_not_begin_is_killed_with_the_reason_and_others_on_order() -> None:
-    server = start_fork_server(ChildPlan(target="tests.child.told_children:fork", name="forks"), None)
+    server = start_fork_server(ChildPlan(target="tests.kit.child_processes:fork", name="forks"), None)
     server.connection.settimeout(WITHIN_S)
 
     def report() -> dict[str, Any]:
