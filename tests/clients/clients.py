@@ -1,6 +1,6 @@
 """The clients that the conformance table runs: how each driver is started, and what it needs.
 
-A driver is one program: ``DRIVER SCENARIO``; `docs/clients.md` says what it reads and writes.
+A driver is one program: ``DRIVER SCENARIO``; `tests/clients/README.md` says what it reads and writes.
 """
 
 from __future__ import annotations

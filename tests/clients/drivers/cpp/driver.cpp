@@ -1,4 +1,4 @@
-// The C++ client in the conformance table: DRIVER SCENARIO, JSON lines on stdout and stdin (docs/clients.md).
+// The C++ client in the conformance table: DRIVER SCENARIO, JSON lines on stdout and stdin (tests/clients/README.md).
 #include <algorithm>
 #include <atomic>
 #include <chrono>
