@@ -50,6 +50,8 @@ __all__ = ["FolderImages", "list_folder", "list_pairs", "pair_folders"]
 _COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "results")
 """Names that other programs give to the folder of the colour images; the first that exists is used (see
 `_find_folder`).  Replica recordings have colour and depth images in ``results``."""
+_VIDEO_ENDINGS = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".3gp"}
+"""Endings of videos, for the hint where a folder without images holds one."""
 _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
 """Names that other programs give to the folder of the depth images; the first that exists is used."""
 _PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")
@@ -175,7 +177,15 @@ def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
         depths = [path for path in colours if "depth" in path.stem.lower()]
         colours = [path for path in colours if path not in set(depths)]
     if not colours:
-        raise UsageError(f"{folder} holds no image", hint="put images into it, or into its folder rgb/")
+        video = next(
+            (path for path in sorted(folder.iterdir()) if path.suffix.lower() in _VIDEO_ENDINGS), None
+        )
+        raise UsageError(
+            f"{folder} holds no image",
+            hint="put images into it, or into its folder rgb/"
+            if video is None
+            else f"name the video: {video}",
+        )
     return _order_by_time(str(folder), colours, depths or None, "depth image", rate_hz)
 
 

@@ -26,10 +26,10 @@ from client_sdk.datasets.rig_recordings import is_euroc, is_kitti
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame
 from client_sdk.rigs.folder_camera import OWN_FILE, find_folder_camera
-from client_sdk.rigs.intrinsics import TYPICAL_HINT, Intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics, calibration_hint
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
-from client_sdk.rigs.rig_file import read_calibration, read_intrinsics, read_rig
+from client_sdk.rigs.rig_file import read_calibration, read_rig
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
@@ -103,6 +103,12 @@ def open_camera(
                 f"{word} is a stereo pair, and {stated_by} is of one camera",
                 hint="name a rig.json of both cameras, or leave it out to use the rig of the source",
             )
+        if own is None and not (path / "rig.json").exists():
+            raise UsageError(
+                f"there is no {path / 'rig.json'}, and the rig is not known",
+                hint="calibrate with a board that both cameras see: rse-pf camera calibrate --stereo SOURCE "
+                f"--board 9x6 --square-mm 25 --out {path / 'rig.json'}",
+            )
         rig = own if isinstance(own, Rig) else read_rig(path / "rig.json")
         images = list_pairs(path, rig.left.lens.rate_hz)
         facts = images.facts(rig.left.lens, str(intrinsics or path / "rig.json"), has_depth=False)
@@ -157,9 +163,14 @@ def open_camera(
         )
     if path.is_dir():
         if own is None:
-            found = find_folder_camera(path, lambda: list_folder(path).size_px)
-            file, own = found or (path / OWN_FILE, read_intrinsics(path / OWN_FILE))
-            stated_by = str(file)
+            images = list_folder(path)
+            found = find_folder_camera(path, lambda: images.size_px)
+            if found is None:
+                raise UsageError(
+                    f"there is no {path / OWN_FILE}, and the intrinsics are not known",
+                    hint=calibration_hint(word, path / OWN_FILE),
+                )
+            stated_by, own = str(found[0]), found[1]
         return _open_folder(path, own, stated_by, rate_hz, depth)
     if word.count(",") == 1 and not path.exists():
         raise UsageError(
@@ -167,7 +178,9 @@ def open_camera(
             hint=f"rse-pf camera calibrate --stereo {word.replace(',', ' ')}; then --intrinsics rig.json",
         )
     if own is None:
-        raise UsageError(f"the intrinsics of {word} are not known", hint=TYPICAL_HINT)
+        raise UsageError(
+            f"the intrinsics of {word} are not known", hint=calibration_hint(word, "intrinsics.json")
+        )
     facts = _facts_of_lens(word, own, stated_by)
     check_source(facts)  # wrong intrinsics are refused before a device is opened
     video = open_video(word)

@@ -24,7 +24,7 @@ from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti,
 from client_sdk.frontend import Frame
 from client_sdk.image_map import map_to_pinhole
 from client_sdk.rigs.folder_camera import OWN_FILE, find_folder_camera
-from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics, calibration_hint
 from client_sdk.rigs.rig_file import read_intrinsics
 from client_sdk.source_facts import (
     CameraFacts,
@@ -62,6 +62,7 @@ _FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
 }
 """Cameras of the TUM benchmark by a part of the folder's name: fx, fy, cx, cy (px), and distortion k1 k2 p1
 p2 k3.  The last entry, for all other names, is the benchmark's default for a Kinect."""
+_OTHER_SOURCES = "a video, or a folder of images only, is mapped by rse-pf map from-camera"
 _FREIBURG_DEPTH_SCALE = 5000.0  # units of a depth image of the TUM benchmark per metre
 
 
@@ -112,12 +113,31 @@ def open_dataset(
         lens, rig = (None, None) if intrinsics is None else lens_or_rig(Path(intrinsics))
         options = BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)
         return dataset_of_bag(open_bag(path, options))
+    _check_calibration(path)
     dataset = _open_single(path, scene, None if intrinsics is None else Path(intrinsics))
     if camera == "stereo":
         raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
     if imu:
         raise UsageError(f"{path} has no IMU", hint="leave out --imu")
     return dataset
+
+
+def _check_calibration(path: Path) -> None:
+    """Refuse a folder with the images of KITTI or EuRoC, and without the file of their calibration.
+
+    Raises:
+        UsageError: The file is missing.
+    """
+    layouts = (("image_0", "", "calib.txt"), ("image_2", "", "calib.txt"),
+               ("mav0/cam0/data", "mav0/cam0/data", "mav0/cam0/sensor.yaml"))  # fmt: skip
+    for images, calibrated, file in layouts:
+        if (path / images).is_dir() and not (path / file).exists() and not is_listed(path):
+            folder = path / calibrated
+            raise UsageError(
+                f"there is no {path / file}, and the intrinsics are not known",
+                hint=f"restore the file; or use the images of one camera without it: rse-pf camera calibrate "
+                f"{folder} --out {folder / OWN_FILE}, then rse-pf map from-camera {folder}",
+            )
 
 
 def _is_bag(path: Path) -> bool:
@@ -141,7 +161,10 @@ def _find_associations(folder: Path) -> Path | None:
 def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Dataset:
     if path.is_file():
         if path.suffix != ".mat":
-            raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
+            raise UsageError(
+                f"{path} is not a recording",
+                hint=f"name a folder, a ROS bag or the .mat file; {_OTHER_SOURCES}",
+            )
         return _open_labelled(path, scene)
     if scene is not None:
         raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
@@ -207,16 +230,10 @@ def _open_tum(folder: Path, named_intrinsics: Path | None) -> Dataset:
         UsageError: A file is missing or broken, or facts about the recording contradict each other.
         MissingExtra: OpenCV is not installed.
     """
-    # 1. Read the lists of images, and the intrinsics.
+    # 1. Read the lists of images.
     colours, depths = _read_lists(folder)
-    stated_by, intrinsics, is_unit_stated, notes = _find_intrinsics(
-        folder,
-        named_intrinsics,
-        lambda: probe_size_px([folder / image for image in colours.images]),
-        has_depth=depths is not None,
-    )
     # 2. Pair each colour image with the depth image that is nearest in time, and leave out those without one;
-    #    in a folder without depth images, use all colour images.
+    #    in a folder without depth images, use all colour images.  Read the intrinsics.
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
@@ -226,6 +243,12 @@ def _open_tum(folder: Path, named_intrinsics: Path | None) -> Dataset:
                 f"colours begin at {colours.stamps_s[0]:.3f} s, depth at {depths.stamps_s[0]:.3f} s",
                 hint="check that rgb.txt and depth.txt use the same clock",
             )
+    stated_by, intrinsics, is_unit_stated, notes = _find_intrinsics(
+        folder,
+        named_intrinsics,
+        lambda: probe_size_px([folder / image for image in colours.images]),
+        has_depth=depths is not None,
+    )
     total, lost = len(colours.images), len(colours.images) - len(pairs)
     unpaired = LossFacts(
         sentence=f"{lost} of {total} colour images of {folder} have no depth image of their own within "
@@ -353,7 +376,9 @@ def _read_rows(path: Path, columns: int) -> list[list[str]]:
         text = read_regular_file(path, _MAX_LIST_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(
-            f"no {path.name} in {path.parent}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images"
+            f"no {path.name} in {path.parent}",
+            hint="name a folder in TUM layout (rgb.txt, depth.txt, images), or of EuRoC or KITTI; "
+            f"{_OTHER_SOURCES}",
         ) from error
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -419,10 +444,19 @@ def _find_intrinsics(
     name = next(key for key in _FREIBURG if key in folder.resolve().name)
     fx, fy, cx, cy, distortion = _FREIBURG[name]
     camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
+    width, height = size_px()
+    calibrate = calibration_hint(f"{folder} --depth-scale {_FREIBURG_DEPTH_SCALE:g}", folder / OWN_FILE)
+    if (width, height) != (camera.width, camera.height):
+        raise UsageError(
+            f"there is no {folder / OWN_FILE}, and images of {width}x{height} px are not those of the "
+            f"benchmark's cameras, which have {camera.width}x{camera.height} px",
+            hint=calibrate,
+        )
     whose = f"those of {name} are used" if name else "a Kinect's are assumed"
     note = (
         f"{folder} has no intrinsics.json, so {whose}: fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}, "
         f"{camera.width}x{camera.height} px, depth_scale {_FREIBURG_DEPTH_SCALE:g}"
+        + ("" if name else f"; if the camera is another one, {calibrate}")
     )
     assumed = Intrinsics(camera=camera, distortion=distortion, depth_scale=_FREIBURG_DEPTH_SCALE)
     return str(folder), assumed, bool(name), (note,)

@@ -34,8 +34,8 @@ from rse_pf.storage.files import read_document
 
 __all__ = [
     "INTRINSICS_HINT",
-    "TYPICAL_HINT",
     "Intrinsics",
+    "calibration_hint",
     "intrinsics_to_json",
     "name_file_in_errors",
     "parse_intrinsics",
@@ -116,11 +116,6 @@ INTRINSICS_HINT = (
     "write fx fy cx cy width height, and distortion [k1 k2 p1 p2 k3] and depth_scale if they are known, as "
     "JSON into intrinsics.json; files of OpenCV, ROS, ORB-SLAM and COLMAP hold them (docs/cameras.md)"
 )
-TYPICAL_HINT = (
-    "calibrate by the motion in the recording: rse-pf camera calibrate SOURCE; or with --board 9x6 "
-    "--square-mm 25 (docs/cameras.md); a typical fx and fy in that file is a guess that bends the map: "
-    "Kinect 525 and RealSense D435 615 px at 640x480; phones 0.8 and webcams 0.9 of the width"
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,6 +172,14 @@ class Intrinsics(Lens):
         return _DEFAULT_DEPTH_SCALE if self.depth_scale is None else self.depth_scale
 
 
+def calibration_hint(source: str, file: Path | str) -> str:
+    """Return the hint for a *source* of one camera whose intrinsics are not known; *file* is to hold them."""
+    return (
+        f"calibrate by the motion that it shows: rse-pf camera calibrate {source} --out {file}, then use "
+        f"--intrinsics {file}; with a board, or by numbers that you know: docs/cameras.md"
+    )
+
+
 def read_json(path: Path, hint: str) -> Any:
     """Return the content of a JSON file of intrinsics or of a rig, of at most 1 MiB.
 
@@ -185,7 +188,9 @@ def read_json(path: Path, hint: str) -> Any:
             large, or is not JSON (its hint is *hint*).
     """
     if not path.exists():
-        raise UsageError(f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT)
+        raise UsageError(
+            f"there is no {path}, and the intrinsics are not known", hint=calibration_hint("SOURCE", path)
+        )
     return read_document(path, "a file of intrinsics", hint=hint, max_bytes=_MAX_FILE_BYTES)
 
 

@@ -240,6 +240,12 @@ def _raw_images(sources: Sequence[str]) -> Iterator[npt.NDArray[np.uint8]]:
 
     paths: list[Path] = []
     for word in sources:
+        if word == "realsense" or Path(word).suffix in (".bag", ".mcap", ".db3"):
+            verb = "map from-camera" if word == "realsense" else "map from-bag"
+            raise UsageError(
+                f"{word} states its own calibration, and is not calibrated here",
+                hint=f"use rse-pf {verb} {word}, or calibrate a video or a folder of its images",
+            )
         euroc = Path(word) / "mav0" / "cam0" / "data"
         folder = euroc if euroc.is_dir() else Path(word)
         paths += list_folder(folder).images if folder.is_dir() else [folder] if is_image(folder) else []

@@ -291,7 +291,8 @@ def _keep(
         why = "its scale is not known" if isinstance(error, UsageError) else f"{error.code}: {error.message}"
         if mapper.keyframes == 0:
             why = "it has no keyframe"
-        kept, line = {"map": None, "map_reason": why}, f"no map is kept: {why}"
+        kept = {"map": None, "map_reason": why}
+        line = f"the map is only in {request.out}, and not in a store: {why}"
     else:
         tenant = "" if request.tenant == DEFAULT_TENANT else f" --tenant {request.tenant}"
         line = f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}{tenant}"

@@ -134,7 +134,7 @@ def test_a_map_above_the_quota_of_its_tenant_is_not_kept_and_the_drive_is(
 
     main(["map", "from-camera", "drive", *PLATFORM, "--objects", "objects", "--tenant", "acme"])
 
-    assert "no map is kept: quota: the tenant 'acme' stores 0 bytes" in capsys.readouterr().out
+    assert "and not in a store: quota: the tenant 'acme' stores 0 bytes" in capsys.readouterr().out
     assert not list(Path("objects").glob("maps/acme/*"))
     assert len(read_ply(Path("out-camera/map.ply"))[0]) > 100
 

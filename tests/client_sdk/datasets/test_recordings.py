@@ -287,5 +287,27 @@ def test_assumed_intrinsics_are_reported(tmp_path: Path):
     (note,) = open_dataset(folder).notes
     assert "has no intrinsics.json, so a Kinect's are assumed: fx 525 fy 525" in note
     assert "depth_scale 5000" in note
+    assert f"rse-pf camera calibrate {folder} --depth-scale 5000" in note
 
     assert open_dataset(write_tum(tmp_path / "known", [0.0])).notes == ()
+
+
+def test_no_intrinsics_are_assumed_for_images_of_another_size(tmp_path: Path):
+    folder = write_tum(tmp_path / "mine", [0.0])
+    (folder / "intrinsics.json").unlink()
+    with pytest.raises(UsageError, match="are not those of the benchmark's cameras") as refused:
+        open_dataset(folder)
+    assert f"rse-pf camera calibrate {folder}" in refused.value.hint
+
+
+@pytest.mark.parametrize(
+    ("images", "file", "mapped"),
+    [("image_0", "calib.txt", "."), ("mav0/cam0/data", "mav0/cam0/sensor.yaml", "mav0/cam0/data")],
+)
+def test_a_missing_calibration_is_named_with_the_way_without_it(
+    tmp_path: Path, images: str, file: str, mapped: str
+):
+    (tmp_path / images).mkdir(parents=True)
+    with pytest.raises(UsageError, match=f"there is no {tmp_path / file}") as refused:
+        open_dataset(tmp_path)
+    assert f"then rse-pf map from-camera {tmp_path / mapped}" in refused.value.hint
