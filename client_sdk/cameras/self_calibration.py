@@ -56,6 +56,12 @@ _MIN_POINT_ANGLE_DEG = 1.5  # points whose rays meet in a smaller angle are left
 _MAX_CENTRE_DEVIATION = 0.005
 """The principal point is estimated if its standard deviation for an image noise of 1 px is at most this
 fraction of the longer side; otherwise the middle of the image is better."""
+_JACKKNIFE_BLOCKS = 6
+"""Number of blocks of successive views, each of which is left out once to find how much the lens depends on
+them: fewer give an uncertain variance, and more take longer."""
+_MODEL_FOCAL_DEVIATION_PERCENT = 0.3
+"""Standard deviation of the focal length, in percent, by which real lenses differ from square pixels and two
+coefficients: fx and fy of EuRoC's cameras differ by this much, and no residual shows it."""
 _MAX_FOCAL_DEVIATION_PERCENT = 3.0
 """Largest standard deviation of the focal length, in percent of it, of a calibration that is not refused."""
 
@@ -66,9 +72,11 @@ class SelfCalibration:
 
     Attributes:
         intrinsics: The calibration; ``views`` is the number of views in the reconstruction.
-        standard_deviations: ``f``, ``cx``, ``cy`` in pixels, ``k1`` and ``k2`` without a unit, from the
-            covariance of the bundle adjustment and the reprojection error.  ``cx`` and ``cy`` are missing if
-            they were not estimated but set to the middle of the image.
+        standard_deviations: ``f``, ``cx``, ``cy`` in pixels, ``k1`` and ``k2`` without a unit.  Their squares
+            are the sum of the variance of the bundle adjustment, which takes all errors of pixels as
+            independent, the variance between parts of the recording (a jackknife over blocks of views), and
+            for ``f`` the variance of the lens model.  ``cx`` and ``cy`` are missing if they were not
+            estimated but set to the middle of the image.
     """
 
     intrinsics: Intrinsics
@@ -127,8 +135,10 @@ def calibrate_from_motion(
         reconstruction = _reconstruct(colmap, folder, len(views))
     on_progress("adjusting")
     # 1. Estimate the principal point, and keep it only if the views determine it.
+    refine_centre = True
     adjusted, variances, rms_px = _adjust(colmap, reconstruction, refine_centre=True)
     if variances is None or np.sqrt(variances[1:3].max()) > _MAX_CENTRE_DEVIATION * max(width, height):
+        refine_centre = False
         adjusted, variances, rms_px = _adjust(colmap, reconstruction, refine_centre=False)
     # 2. Refuse a calibration that does not fit, or is not determined by these views.
     f, cx, cy, k1, k2 = (float(value) for value in adjusted.camera(1).params)
@@ -137,7 +147,11 @@ def calibrate_from_motion(
             f"the reprojection error is {rms_px:.2f} px, above {max_rms_px:g} px",
             hint="record with more light and slower, in a scene where nothing else moves",
         )
-    deviations = np.full(1, np.inf) if variances is None else rms_px * np.sqrt(variances)
+    deviations = np.full(1, np.inf)
+    if variances is not None:
+        between_parts = _jackknife_variances(colmap, adjusted, refine_centre=refine_centre)
+        deviations = np.sqrt(rms_px**2 * variances + between_parts)
+        deviations[0] = np.hypot(deviations[0], _MODEL_FOCAL_DEVIATION_PERCENT / 100 * f)
     deviation_percent = 100 * float(deviations[0]) / f
     if deviation_percent > _MAX_FOCAL_DEVIATION_PERCENT or max(abs(k1), abs(k2)) > _MAX_DISTORTION:
         raise CommandFailed(
@@ -303,22 +317,48 @@ def _adjust(colmap: Any, reconstruction: Any, *, refine_centre: bool) -> tuple[A
         coordinate, px.
     """
     adjusted = colmap.Reconstruction(reconstruction)
-    options = colmap.BundleAdjustmentOptions(refine_principal_point=refine_centre, print_summary=False)
-    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
-    options.ceres.solver_options.num_threads = 1
-    config = colmap.BundleAdjustmentConfig()
-    for image_id in adjusted.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for _ in range(2):
-        adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, adjusted)
-        adjuster.solve()
+        _solve(colmap, adjusted, refine_centre=refine_centre)
         colmap.ObservationManager(adjusted).filter_all_points3D(_OUTLIER_PX, _MIN_POINT_ANGLE_DEG)
-    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, adjusted)
-    adjuster.solve()
+    adjuster = _solve(colmap, adjusted, refine_centre=refine_centre)
     covariance = colmap.estimate_ba_covariance(colmap.BACovarianceOptions(), adjusted, adjuster)
     lens = None if covariance is None else covariance.get_other_params_cov(adjusted.camera(1).params)
     adjusted.update_point_3d_errors()
     squared = [point.error**2 * point.track.length() for point in adjusted.points3D.values()]
     rms_px = float(np.sqrt(sum(squared) / (2 * adjusted.compute_num_observations())))
     return adjusted, None if lens is None else np.diag(lens), rms_px
+
+
+def _solve(colmap: Any, reconstruction: Any, *, refine_centre: bool) -> Any:
+    """Adjust poses, points and lens of a reconstruction, and return the bundle adjuster."""
+    options = colmap.BundleAdjustmentOptions(refine_principal_point=refine_centre, print_summary=False)
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = 1
+    config = colmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+    adjuster.solve()
+    return adjuster
+
+
+def _jackknife_variances(colmap: Any, adjusted: Any, *, refine_centre: bool) -> Array:
+    """Return the variances of the estimated parameters of the lens that leaving out blocks of views shows.
+
+    Errors of pixels that are alike in successive views, such as those of edges of objects, are not seen by
+    the covariance of a bundle adjustment.
+
+    Source:
+        The delete-a-group jackknife: Kott, Journal of Official Statistics 2001.
+    """
+    lenses = []
+    for block in np.array_split(sorted(adjusted.reg_image_ids()), _JACKKNIFE_BLOCKS):
+        rest = colmap.Reconstruction(adjusted)
+        for image_id in block:
+            rest.deregister_frame(rest.image(int(image_id)).frame_id)
+        _solve(colmap, rest, refine_centre=refine_centre)
+        f, cx, cy, k1, k2 = rest.camera(1).params
+        lenses.append([f, cx, cy, k1, k2] if refine_centre else [f, k1, k2])
+    variances: Array = (_JACKKNIFE_BLOCKS - 1) * np.var(lenses, axis=0)
+    return variances

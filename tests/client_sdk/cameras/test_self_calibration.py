@@ -68,6 +68,7 @@ def camera_above_a_plane(count: int) -> list[_Image]:
     return views
 
 
+@pytest.mark.timeout(300)
 def test_a_drive_gives_the_lens_with_its_uncertainty(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
