@@ -39,6 +39,7 @@ RUNS = {
 RUNS_ON_RECORDINGS = {
     "cloud.batch": (["--copies", "2", "--frames", "12", "--candidates", "1"], "links"),
     "live.one_process": (["kitchen", "--runs", "0"], "one_robot.final_cm"),
+    "maps.calibration": (["DATA", "--only", "kitchen"], "kitchen.seconds"),
     "maps.photos": (["DATA", "--n", "2"], "cpu_p50_ms"),
     "maps.starts": (["DATA", "--only", "rest", "--seconds", "0.5"], "rest.n"),
     "maps.tracking": (["--only", "3 Hz from frame 0, m"], "rows.fr1/rpy, 3 Hz from frame 0, mirrored.frames"),
