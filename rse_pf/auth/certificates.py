@@ -1,8 +1,8 @@
 """A certificate authority of one platform, and the server certificates that it issues (X.509, ECDSA P-256).
 
-The authority may vouch for addresses and for names under ``local`` only, so that a browser that trusts it
-cannot be misled about any other site by somebody who stole its key.  The time is an argument; keys come from
-the operating system through `cryptography`.  Files belong to the caller.
+The authority may certify IP addresses and names under ``local`` only (name constraints), so that a thief of
+its key cannot impersonate other sites to a browser that trusts it.  The caller passes the time, and reads and
+writes the files; keys come from the operating system through `cryptography`.
 
 Source:
     RFC 5280, chapter "Certificate Extensions": subject alternative name, name constraints.
@@ -30,7 +30,7 @@ AUTHORITY_S = 3650 * 86400
 SERVER_S = 90 * 86400
 """How long a server certificate is valid; browsers refuse more than 398 days."""
 _EARLIER_S = 86400
-"""A certificate is valid from so long before it was made: the clock of a robot may be slow."""
+"""A certificate is valid from this long before it was made: the clock of a robot may be slow."""
 _HINT = "remove the file; a new one is made, and robots must be enrolled again"
 
 

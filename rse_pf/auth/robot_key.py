@@ -17,7 +17,8 @@ from rse_pf.storage.files import create_private_file, read_private_file
 
 __all__ = ["RobotKey", "make_robot_key"]
 
-_SEED_BYTES, _ID_BYTES = 32, 12
+_SEED_BYTES = 32  # of an Ed25519 key
+_ID_BYTES = 12  # of the random id of a token, by which an operator can revoke it
 
 
 class RobotKey:

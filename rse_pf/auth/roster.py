@@ -1,4 +1,4 @@
-"""Which robots have keys of their own (the roster), and which tokens and robots are refused (the deny list).
+"""The roster, which lists the enrolled robots, and the deny list, which lists refused tokens and robots.
 
 An operator writes both, every server reads both; `rse_pf.auth.trust_store` stores and loads them.  They hold
 public keys, names and times, no secrets.
@@ -57,7 +57,8 @@ _SCOPE = re.compile(
     rf"|{SYNTHETIC}"
 )
 _X = re.compile(r"[A-Za-z0-9_-]{43}")
-_MAX_CHARACTERS, _MAX_SCOPES = 64, 64
+_MAX_CHARACTERS = 64  # of a name: it is shown in one line, and part of object names
+_MAX_SCOPES = 64  # of one robot, which its token carries in each handshake
 MAX_ROBOTS_OF_TENANT = 10_000
 MAX_ROSTER_BYTES = 16 << 20
 """Every worker of every server reads the whole roster when it changes."""

@@ -1,7 +1,7 @@
 """Serve control ports: a very small HTTP/1.1 server for health checks, metrics, drain and other operations.
 
-A request has at most 8 KiB of head and no chunked body.  A connection's first one must be complete within
-`FIRST_REQUEST_S`, and each further one within `KEEP_ALIVE_S` of the answer before.
+A request has a head of at most 8 KiB and no chunked body.  The first request of a connection must be complete
+within `FIRST_REQUEST_S`, and each later one within `KEEP_ALIVE_S` after the reply before it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["ControlReply", "ControlRequest", "json_reply", "number_of", "refused
 _MAX_HEAD_BYTES = 8192
 _MAX_BODY_BYTES = 65536
 _WRITE_S = 5.0
-"""A client that takes longer to read what was written is cut."""
+"""The connection of a client that takes longer to read a reply is closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class ControlRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlReply:
-    """One response: *body*, or *events*, a JSON object a line as they come, and the connection ends then."""
+    """One response: *body*, or *events* as lines of JSON, after which the connection is closed."""
 
     status: int = 200
     body: bytes = b""

@@ -24,7 +24,8 @@ from rse_pf.processes.start import Child, ChildPlan, how_ended, start_child
 
 __all__ = ["ForkPlan", "read_packet", "send_order", "serve_forks", "start_fork_server"]
 
-_MOST_BYTES, _MOST_FDS = 1 << 20, 2
+_MAX_PACKET_BYTES = 1 << 20  # a configuration has at most 100 kB
+_MAX_DESCRIPTORS = 2  # that one packet carries
 
 
 # --- the parent's side ------------------------------------------------------------------------------------
@@ -52,7 +53,7 @@ def read_packet(connection: socket.socket) -> tuple[Any, list[int]]:
     how it ended and the CPU seconds that it took, each as an ``event``.
     """
     try:
-        message, descriptors, _, _ = socket.recv_fds(connection, _MOST_BYTES, _MOST_FDS)
+        message, descriptors, _, _ = socket.recv_fds(connection, _MAX_PACKET_BYTES, _MAX_DESCRIPTORS)
     except (BlockingIOError, TimeoutError):
         raise
     except OSError:

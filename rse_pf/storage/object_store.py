@@ -41,7 +41,8 @@ __all__ = [
 ]
 
 _Names = list[str]  # within a class that has a method "list"
-_SHARD, _LOCK = "+", ".lock-"
+_SHARD = "+"  # begins the names of subfolders for the objects of a robot, by the first digits of the digest
+_LOCK = ".lock-"  # begins the names of lock files
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _WRITE_TRIES = 8
 # A folder that changed within this time before it was read may change again at the same time of change.

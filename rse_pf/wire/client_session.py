@@ -55,7 +55,10 @@ __all__ = [
 ]
 
 _CAPABILITIES = ("move", PROGRESS, UPDATES)
-_MAX_TRIES_AFTER_LOSS, _RETRY_BURST = 2, 5.0
+_MAX_TRIES_AFTER_LOSS = 2
+"""Times that a command is sent again after the answer ``worker-lost``: the command may be the cause."""
+_RETRY_BURST = 5.0
+"""Retries after busy that a robot may make at once, before `RETRY_SHARE` limits them."""
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
 RETRY_SHARE = 0.1

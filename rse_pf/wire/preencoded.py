@@ -18,9 +18,11 @@ from rse_pf.wire.messages import Command
 
 __all__ = ["PreencodedCommand", "encode_command", "encode_payload", "preencode"]
 
-_ENVELOPE_LEVEL, _ENVELOPE_MEMORY = 1, 1
-_HEADER = b"\x78\x9c"
-_BEFORE, _AFTER = b',"payload":', b"}"
+_ENVELOPE_LEVEL = 1  # level of zlib: an envelope has some 100 bytes
+_ENVELOPE_MEMORY = 1  # memory level of zlib, the smallest: the compressor is made for each command
+_HEADER = b"\x78\x9c"  # of a zlib stream (RFC 1950)
+_BEFORE = b',"payload":'  # text of a command before the payload
+_AFTER = b"}"  # text of a command after the payload
 
 _encode_json = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
 _encode_binary = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
