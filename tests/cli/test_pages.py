@@ -82,7 +82,8 @@ def half_a_complaint(command: str) -> str:
     if verb not in VERBS:
         return "no verb"
     parser = parser_of(verb)
-    words = [parser.default_action, *words] if words[:1] and words[0].startswith("-") else words
+    if parser.default_action and words[:1] and words[0].startswith("-"):
+        words = [parser.default_action, *words]
     actions = parser._actions
     known = {option for action in actions for option in action.option_strings}
     choices = next((each.choices for each in actions if not each.option_strings and each.choices), None)

@@ -105,7 +105,7 @@ def test_the_exit_code_is_1_if_no_photo_is_found(platform: Platform) -> None:
         (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--store", "dir:x"], "--store"),
         (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--enrolment", "x"], "--enrolment names"),
         (["kitchen", "known.jpg", "--intrinsics", "none.json"], "none.json"),
-        (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--authority", "phone.token"], "no certificate"),
+        (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--authority", "phone.token"], "not a certificate"),
         (["garage", "known.jpg", "--camera", "1,2,3,4"], "there is no map 'garage'"),
         (["../maps", "known.jpg", "--camera", "1,2,3,4"], ""),
     ],
