@@ -477,11 +477,13 @@ def test_a_plain_user_has_the_same_isolation(tmp_path):
         pytest.skip("no python3 outside of this user's home, or no setpriv")
     package = Path(__file__).resolve().parents[3] / "rse_pf"
     copied = tmp_path / "rse_pf" / "server" / "sandbox"
-    copied.mkdir(parents=True)
-    for source in ("server/sandbox/isolation.py", "server/sandbox/seccomp.py", "linux.py"):
+    processes = tmp_path / "rse_pf" / "processes"
+    for folder in (copied, processes):
+        folder.mkdir(parents=True)
+    for source in ("server/sandbox/isolation.py", "server/sandbox/seccomp.py", "processes/linux.py"):
         (tmp_path / "rse_pf" / source).write_text((package / source).read_text())
         (tmp_path / "rse_pf" / source).chmod(0o644)
-    for folder in (copied, *copied.parents):
+    for folder in (processes, copied, *copied.parents):
         if folder != Path("/tmp") and folder.is_relative_to("/tmp"):
             folder.chmod(0o755)
     script = f"""
