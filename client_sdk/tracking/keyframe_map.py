@@ -7,6 +7,7 @@ are fused by their covariances.  The pose of a keyframe is not adjusted when fur
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from client_sdk.tracking.landmark_matching import (
     Matches,
     shift_landmarks,
 )
+from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
@@ -181,6 +183,8 @@ class KeyframeMap:
         views: Image of each keyframe, oldest first; not to be changed by others.
         seen: ``(n,)`` for each keyframe: the landmark of each of its features, or NO_LANDMARK.
         poses: ``T_world_camera`` ``(k, 4, 4)`` of the keyframes.
+        last_pose: ``(4, 4)``, pose of the newest frame, which need not be a keyframe.
+        last_stamp_s: Time of that frame, in seconds.
     """
 
     def __init__(self, max_keyframes: int) -> None:
@@ -188,6 +192,8 @@ class KeyframeMap:
         self.views: list[View] = []
         self.seen: list[Rows] = []
         self.poses: Array = np.empty((0, 4, 4))
+        self.last_pose: Array = np.eye(4)
+        self.last_stamp_s = -math.inf
         self._place_vectors: npt.NDArray[np.float32] = np.empty((0, 0), dtype=np.float32)
         self._count = 0
         self._table = _allocate(_INITIAL_CAPACITY, np.empty((0, 0), dtype=np.uint8))
@@ -248,9 +254,24 @@ class KeyframeMap:
         cosines = (np.einsum("nij,ij->n", self.poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
         return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
-    def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
-        """Return the *count* keyframes whose place vectors are most similar to an image's, best first."""
-        ranked: list[int] = np.argsort(-(self._place_vectors @ place.get()), kind="stable").tolist()
+    def set_last(self, T_world_camera: Array, stamp_s: float) -> None:
+        """Note the pose ``(4, 4)`` and the time of the newest frame."""
+        self.last_pose, self.last_stamp_s = T_world_camera, stamp_s
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of the keyframes and of the newest frame in the order of time."""
+        stamps_s = np.array([*(view.timestamp_s for view in self.views), self.last_stamp_s])
+        order = np.argsort(stamps_s, kind="stable")
+        return Trajectory(stamps_s[order], np.concatenate([self.poses, self.last_pose[None]])[order])
+
+    def rank_by_similarity(self, place: LazyPlaceVector, count: int, among: Rows | None = None) -> list[int]:
+        """Return the *count* keyframes whose place vectors are most similar to an image's, best first.
+
+        Only keyframes of *among* are considered, all for None.
+        """
+        numbers = np.arange(len(self.views)) if among is None else among
+        similarities = self._place_vectors[numbers] @ place.get()
+        ranked: list[int] = numbers[np.argsort(-similarities, kind="stable")].tolist()
         return ranked[:count]
 
     def matched(self, numbers: Rows, features: Rows) -> Matches:
@@ -389,7 +410,7 @@ class KeyframeMap:
     def move(self, T_new_old: Array) -> None:
         """Express the whole map in another world frame, by the ``(4, 4)`` rigid motion *T_new_old*."""
         rotation, table = T_new_old[:3, :3], self._table.first(self._count)
-        self.poses = T_new_old @ self.poses
+        self.poses, self.last_pose = T_new_old @ self.poses, T_new_old @ self.last_pose
         table.points[:] = transform(T_new_old, table.points)
         table.covariances[:] = rotation @ table.covariances @ rotation.T
         for directions in (table.shutter_displacements, table.rays, table.orientations):
@@ -441,6 +462,8 @@ class KeyframeMap:
         self.views += other.views
         self.seen += [shift_landmarks(seen, first) for seen in other.seen]
         self.poses = np.concatenate([self.poses, other.poses])
+        if other.last_stamp_s > self.last_stamp_s:
+            self.set_last(other.last_pose, other.last_stamp_s)
         self._place_vectors = np.concatenate([self._place_vectors, other._place_vectors])
         self._reserve(first + other._count)
         self._count += other._count

@@ -292,6 +292,11 @@ class LandmarkMap:
             np.concatenate([self.landmarks_of(keyframe) for keyframe in self.local_keyframes(number)])
         )
 
+    @property
+    def positions(self) -> Array:
+        """Positions ``(k, 3)`` of all keyframes."""
+        return np.array([inverse(keyframe.T_camera_world)[:3, 3] for keyframe in self.keyframes])
+
     def rank_by_similarity(self, place: LazyPlaceVector, count: int, among: Rows | None = None) -> list[int]:
         """Return the *count* keyframes whose place vectors are most similar to an image's, best first.
 

@@ -108,6 +108,11 @@ class Similarity:
     T: Array
     scale: float
 
+    def moved(self, position: Array) -> Array:
+        """Return where a ``(3,)`` position of the segment lies in the other one."""
+        place: Array = transform(self.T, self.scale * position[None])[0]
+        return place
+
     def inverted(self, segment: int, keyframe: int) -> Similarity:
         """Return the inverse similarity: where the other segment lies in this one.
 
@@ -129,7 +134,7 @@ class Similarity:
                 same point of the other segment.
             depth: Median depth of the place in the unit of the other segment; distances are compared with it.
         """
-        first, second = (transform(s.T, s.scale * centre[None])[0] for s in (self, other))
+        first, second = self.moved(centre), other.moved(centre)
         _, apart_deg = pose_difference(self.T, other.T)
         scale_ratio = max(self.scale / other.scale, other.scale / self.scale)
         return (

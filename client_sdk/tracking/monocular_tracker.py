@@ -36,6 +36,7 @@ from client_sdk.tracking.landmark_matching import (
     Matches,
     make_place_vector,
     match_candidates,
+    match_distant_place,
     match_known_places,
     match_other_segments,
     shift_landmarks,
@@ -48,6 +49,13 @@ from client_sdk.tracking.monocular_segment import (
     measure_scale,
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
+from client_sdk.tracking.reachability import (
+    ALIAS_DEPTH_SHARE,
+    MAX_DRIFT,
+    REACH_DEPTH_SHARE,
+    reach_after,
+    reach_at_begin,
+)
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.tracking.waiting_frames import MIN_START_MATCHES, Start, WaitingFrames
 from client_sdk.trajectory import Trajectory
@@ -134,6 +142,8 @@ class _TrackState:
             known place.
         candidate: Where the segment may lie in another one, or its newest part in an older one, measured once
             and not confirmed by a second measurement; None without one.
+        first_position: ``(3,)``, of the camera in the present segment at the first of the measurements in a
+            row that agree with the candidate.
         next_loop_keyframe: Number of the first keyframe for which a loop closure is looked for, after the
             last loop closure.
     """
@@ -144,6 +154,7 @@ class _TrackState:
     T_next_last: Array = field(default_factory=lambda: np.eye(4))
     unrecognised: int = 0
     candidate: Similarity | None = None
+    first_position: Array = field(default_factory=lambda: np.zeros(3))
     next_loop_keyframe: int = 0
 
 
@@ -175,10 +186,12 @@ class MonocularTracker:
     A segment begins with two views that have parallax; when the second view comes, the frames that waited
     before it also get poses.  A frame is matched near the pixels at which a constant velocity predicts the
     landmarks around the reference keyframe, then in a wider radius, then with the last frame, then with the
-    newest keyframes and with the most similar keyframes of all segments.  If no pose fits, the frame is lost,
+    newest keyframes and with the most similar keyframes of all segments; such a place is accepted only if the
+    camera can have moved there, and if no other place looks the same.  If no pose fits, the frame is lost,
     and waits for the start of a new segment.  Two segments are joined when two measurements in a row agree
-    where one lies in the other; the newer segment is moved into the older one, whose unit it takes.  An older
-    place of the same segment that is recognised twice closes a loop and corrects what drifted in between.
+    where one lies in the other, under the same two conditions; the newer segment is moved into the older one,
+    whose unit it takes.  An older place of the same segment that is recognised twice closes a loop and
+    corrects what drifted in between, if the camera can have drifted that far.
 
     Attributes:
         options: Options of tracking.
@@ -484,6 +497,10 @@ class MonocularTracker:
             posed, reason = self._verify(segment, view, answer, count, keyframe)
             if posed is None:
                 continue
+            # 4. Accept a known place only if the camera can have moved there, and to no place like it.
+            if keyframe is not None and not (yield from self._is_certain_place(posed, attempt)):
+                reason = "a place to which the camera cannot have moved, or of which there are several"
+                continue
             if keyframe is not None:
                 self._state = replace(self._state, segment=attempt.segment, last=None, candidate=None)
                 segment.set_reference(keyframe)
@@ -548,6 +565,51 @@ class MonocularTracker:
         if fitted is None:
             return None, "too few landmarks agree with the pose"
         return replace(fitted, matches=match_count, is_weak=answer.is_weak), ""
+
+    def _is_certain_place(
+        self, posed: PosedView, attempt: _Attempt
+    ) -> Generator[PoseQuery, QueryAnswer, bool]:
+        """Return whether the camera can have moved to a recognised place, and to no place like it.
+
+        A frame after a tracked one may be anywhere near its pose: the motion between two images can change.
+        """
+        position, last = inverse(posed.T_camera_world)[:3, 3], self._state.last
+        reach = reach_after(self._segments[attempt.segment].trajectory(), self._frame.timestamp_s)
+        distance = float(np.median(np.linalg.norm(attempt.matches.points - position, axis=1)))
+        is_next = False
+        if last is not None and attempt.segment == self._state.segment:
+            is_next = bool(np.linalg.norm(position - inverse(last.T_camera_world)[:3, 3]) <= distance)
+        if not is_next and reach.excess(position) > REACH_DEPTH_SHARE * distance:
+            return False
+        alias = yield from self._find_alias(posed.view, attempt.segment, position, distance)
+        return alias is None or reach.separates(position, alias)
+
+    def _find_alias(
+        self, view: MonocularView, segment: int, position: Array, distance: float
+    ) -> Generator[PoseQuery, QueryAnswer, Array | None]:
+        """Ask for the pose of an image at another place of a segment that looks the same as a recognised one.
+
+        Returned is the position ``(3,)`` of the camera there, None without such a place.
+
+        Args:
+            view: The image.
+            segment: Number of the segment.
+            position: ``(3,)``, of the camera at the recognised place, in the frame of the segment.
+            distance: Distance of what the camera sees there, in the unit of the segment.
+        """
+        min_distance = ALIAS_DEPTH_SHARE * distance
+        distances = np.linalg.norm(self._segments[segment].map.positions - position, axis=1)
+        other = match_distant_place(
+            self._maps, segment, distances, min_distance, view.place_vector, view.features
+        )
+        if other is None or len(other.matches) < CLEAR_INLIERS:
+            return None
+        answer = yield self._make_query(view, other.matches, "keyframe")
+        pose = answer.accepted_pose(CLEAR_INLIERS) if self._is_clear(answer, len(other.matches)) else None
+        if pose is None:
+            return None
+        alias = inverse(pose)[:3, 3]
+        return alias if np.linalg.norm(alias - position) > min_distance else None
 
     # --- The start of a segment ---
 
@@ -710,16 +772,50 @@ class MonocularTracker:
         """
         last, present = self._state.last, self._state.segment
         assert last is not None
+        # 1. Measure where the present segment lies by the keyframe of another one with the most matches.
         best = match_other_segments(self._maps, last.view.place_vector, last.view.features, present)
         similarity = yield from self._measure_similarity(last, best)
         if similarity is None:
             return
-        # Move the newer of the two segments into the older one, whose poses and unit stay as they are.
+        # 2. Leave out a place that the camera cannot have reached, or that is not the only one of its kind.
+        if not (yield from self._is_certain_join(last, similarity)):
+            return
+        # 3. Move the newer of the two segments into the older one, whose poses and unit stay as they are.
         if similarity.segment < present:
             self._join(present, similarity, self._present.reference)
         else:
             back = similarity.inverted(present, self._present.reference)
             self._join(similarity.segment, back, similarity.keyframe)
+
+    def _is_certain_join(
+        self, last: PosedView, similarity: Similarity
+    ) -> Generator[PoseQuery, QueryAnswer, bool]:
+        """Return whether the camera can have moved from the older to the newer segment, at this place only.
+
+        *similarity* tells where the present segment, which has the frame *last*, lies in another one.
+        """
+        # 1. Compute how far outside of the camera's reach the newer segment begins, in the other's unit.
+        present, other = self._state.segment, similarity.segment
+        paths = {number: self._segments[number].trajectory() for number in (present, other)}
+        reach = reach_at_begin(paths[min(present, other)], paths[max(present, other)])
+        begin, unit = paths[max(present, other)].positions[0], 1.0
+        if present < other:
+            back = similarity.inverted(present, self._present.reference)
+            begin, unit = back.moved(begin), similarity.scale
+        else:
+            begin = similarity.moved(begin)
+        depth = self._segments[other].map.median_depth(similarity.keyframe)
+        centre = inverse(last.T_camera_world)[:3, 3]
+        if unit * reach.excess(begin) > REACH_DEPTH_SHARE * depth:
+            # The place may be another one that looks the same.  Two such places do not overlap: wait until
+            # the camera has moved farther than they can be apart.
+            moved = similarity.scale * float(np.linalg.norm(centre - self._state.first_position))
+            if moved < unit * reach.farthest(begin):
+                return False
+        # 2. Look for another place in the other segment that looks the same.
+        position = similarity.moved(centre)
+        alias = yield from self._find_alias(last.view, other, position, depth)
+        return alias is None or reach.separates(begin, begin + (alias - position) / unit)
 
     def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
         """Ask for the place of a new keyframe among older ones; close a loop once two measurements agree."""
@@ -739,7 +835,13 @@ class MonocularTracker:
         similarity = yield from self._measure_similarity(state.last, best)
         if similarity is None:
             return
-        # 3. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
+        # 3. Leave out a place that is farther away than the camera can have drifted: it looks the same.
+        positions = own.positions
+        length = float(np.linalg.norm(np.diff(positions[best.keyframe :], axis=0), axis=1).sum())
+        drift = float(np.linalg.norm(similarity.moved(positions[-1]) - positions[-1]))
+        if drift > MAX_DRIFT * length + ALIAS_DEPTH_SHARE * own.median_depth(best.keyframe):
+            return
+        # 4. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
         self._state = replace(
             self._state,
             T_next_last=scaled(self._state.T_next_last, similarity.scale),
@@ -785,11 +887,16 @@ class MonocularTracker:
             scale=scale,
         )
         previous = self._state.candidate
-        self._state = replace(self._state, candidate=measured)
-        if previous is None or previous.segment != best.segment:
-            return None
         centre, depth = inverse(posed.T_camera_world)[:3, 3], segment.map.median_depth(best.keyframe)
-        return measured if previous.agrees_with(measured, centre, depth) else None
+        if (
+            previous is None
+            or previous.segment != best.segment
+            or not previous.agrees_with(measured, centre, depth)
+        ):
+            self._state = replace(self._state, candidate=measured, first_position=centre)
+            return None
+        self._state = replace(self._state, candidate=measured)
+        return measured
 
     def _join(self, segment: int, similarity: Similarity, keyframe: int) -> None:
         """Move all of *segment*, the newer one, into an older segment, which keeps its frame and its unit.

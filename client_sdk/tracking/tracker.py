@@ -32,11 +32,20 @@ from client_sdk.tracking.landmark_matching import (
     Candidate,
     Matches,
     make_place_vector,
+    match_distant_place,
     match_known_places,
     match_other_segments,
     shift_landmarks,
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
+from client_sdk.tracking.reachability import (
+    ALIAS_DEPTH_SHARE,
+    REACH_DEPTH_SHARE,
+    Reach,
+    reach_after,
+    reach_at_begin,
+    reach_between,
+)
 from client_sdk.tracking.rolling_shutter import (
     ReadoutEstimate,
     correct_view,
@@ -45,7 +54,7 @@ from client_sdk.tracking.rolling_shutter import (
 )
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
-from rse_pf.geometry import Array, inverse, orthonormalise, pose_difference, rigid
+from rse_pf.geometry import Array, inverse, orthonormalise, pose_difference, rigid, transform
 from rse_pf.slam.tracking import GuidedMatchLimits, fit_pose
 
 __all__ = ["Tracker"]
@@ -88,6 +97,28 @@ two to confirm each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _JoinCandidate:
+    """Where the present segment may lie in another one, measured once or more often.
+
+    Attributes:
+        segment: Number of the other segment.
+        T_other_present: ``(4, 4)``, pose of the present segment's world in that of the other one.
+        first_position: ``(3,)``, of the camera in the present segment at the first of the measurements in a
+            row that agree.
+    """
+
+    segment: int
+    T_other_present: Array
+    first_position: Array
+
+    def agrees_with(self, segment: int, T_other_present: Array) -> bool:
+        """Return whether a further measurement confirms this one."""
+        apart_m, apart_deg = pose_difference(self.T_other_present, T_other_present)
+        is_near = apart_m <= _MAX_JOIN_DIFFERENCE_M and apart_deg <= MAX_JOIN_DIFFERENCE_DEG
+        return segment == self.segment and is_near
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _TrackState:
     """What a tracker knows of the camera between two frames.
 
@@ -107,8 +138,7 @@ class _TrackState:
         unrecognised: Number of frames since the last accepted pose that show enough features and no known
             place.
         segment: Number of the present segment, -1 before the first.
-        join_candidate: Number of another segment and ``T_other_present`` ``(4, 4)``, the pose of the present
-            segment's world in that of the other one, measured once and not confirmed; None without one.
+        join_candidate: Where the present segment may lie in another one; None without a measurement.
     """
 
     T_world_camera: Array
@@ -121,7 +151,7 @@ class _TrackState:
     lost_in_a_row: int = 0
     unrecognised: int = 0
     segment: int = -1
-    join_candidate: tuple[int, Array] | None = None
+    join_candidate: _JoinCandidate | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -149,6 +179,10 @@ class _Attempt:
         """Whether the matches show a known place, and are not those around the last pose."""
         return self.against in ("keyframe", "segment")
 
+    def distance_to(self, position: Array) -> float:
+        """Return the median distance of the matched landmarks from a ``(3,)`` position, in metres."""
+        return float(np.median(np.linalg.norm(self.matches.points - position, axis=1)))
+
 
 class Tracker:
     """Visual odometry with relocalisation; takes one frame and one query at a time.
@@ -165,10 +199,12 @@ class Tracker:
     A frame is matched near the pixels at which a constant velocity predicts the landmarks of the nearest
     keyframes and of the last frame.  If no pose fits, it is matched with the last frame by appearance; a
     stereo pair is then matched in a wide radius around its last pose.  If no pose fits again, it is matched
-    with the newest keyframes and with the most similar keyframes of all segments.  Otherwise the frame is
+    with the newest keyframes and with the most similar keyframes of all segments; such a place is accepted
+    only if the camera can have moved there, and if no other place looks the same.  Otherwise the frame is
     lost, and the next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised
     frames a new segment begins at the last accepted pose.  Two segments are joined when two measurements in a
-    row agree where one lies in the other; the newer segment is moved into the older one.  A frame with a weak
+    row agree where one lies in the other, under the same two conditions; the newer segment is moved into the
+    older one.  A frame with a weak
     pose never becomes a keyframe.
 
     Attributes:
@@ -294,6 +330,7 @@ class Tracker:
             self.disparity_offset_px += own.offset_px
             moved = own.moved(np.array([state.timestamp_s]), state.T_world_camera[None])[0]
             state = replace(state, T_world_camera=orthonormalise(moved))
+            self._map.set_last(state.T_world_camera, state.timestamp_s)
         self._state = state
         self._plugins.forget_poses()
         return clear
@@ -474,6 +511,9 @@ class Tracker:
             posed = self._verify(image, T_world_camera, attempt, answer, is_continuous=is_continuous)
             if posed is None:
                 continue
+            # 4. Accept a known place only if the camera can have moved there, and to no place like it.
+            if attempt.is_recognised and not (yield from self._is_certain_place(posed, attempt)):
+                continue
             if attempt.segment != self._state.segment:
                 self._state = replace(self._state, segment=attempt.segment, last=None, join_candidate=None)
             return posed, max_count
@@ -525,8 +565,55 @@ class Tracker:
         """
         position = T_world_camera[:3, 3]
         moved_m = np.linalg.norm(position - self._state.T_world_camera[:3, 3])
-        distance_m = np.median(np.linalg.norm(attempt.matches.points - position, axis=1))
-        return attempt.segment == self._state.segment and bool(moved_m <= distance_m)
+        return attempt.segment == self._state.segment and bool(moved_m <= attempt.distance_to(position))
+
+    def _is_certain_place(
+        self, posed: PosedView, attempt: _Attempt
+    ) -> Generator[PoseQuery, QueryAnswer, bool]:
+        """Return whether the camera can have moved to a recognised place, and to no place like it.
+
+        A frame after a tracked one may be anywhere near its pose: the motion between two images can change.
+        """
+        position, own = posed.T_world_camera[:3, 3], self._map.trajectory()
+        if attempt.segment == self._state.segment:
+            reach = reach_after(own, self._frame.timestamp_s)
+        else:
+            path = self._segments[attempt.segment].trajectory()
+            reach = reach_between(path, own, self._frame.timestamp_s)
+        is_next = not self._state.lost_in_a_row and self._is_near(posed.T_world_camera, attempt)
+        if not is_next and reach.excess(position) > REACH_DEPTH_SHARE * attempt.distance_to(position):
+            return False
+        alias = yield from self._find_alias(posed, attempt)
+        return alias is None or reach.separates(position, alias)
+
+    def _find_alias(
+        self, posed: PosedView, attempt: _Attempt
+    ) -> Generator[PoseQuery, QueryAnswer, Array | None]:
+        """Ask for the pose of an image at another place of a segment that looks the same as a recognised one.
+
+        Returned is the position ``(3,)`` of the camera there, None without such a place.
+        """
+        view, position, segment = posed.view, posed.T_world_camera[:3, 3], attempt.segment
+        min_distance_m = ALIAS_DEPTH_SHARE * attempt.distance_to(position)
+        distances_m, _ = self._segments[segment].distances(posed.T_world_camera)
+        other = match_distant_place(
+            self._segments, segment, distances_m, min_distance_m, view.place_vector, view.features
+        )
+        if other is None or len(other.matches) < CLEAR_INLIERS:
+            return None
+        T_world_camera, answer = yield from self._solve(view, self._attempt_at(other, "keyframe"))
+        if T_world_camera is None or not answer.is_clear(min(len(other.matches), self._max_matches)):
+            return None
+        is_apart = np.linalg.norm(T_world_camera[:3, 3] - position) > min_distance_m
+        return T_world_camera[:3, 3] if is_apart and self._looks_right(T_world_camera, segment) else None
+
+    def _looks_right(self, T_world_camera: Array, segment: int) -> bool:
+        """Return whether the image looks as a pose in a segment predicts; True for a user's features."""
+        if self._plugins.features is not None:
+            return True
+        return has_predicted_appearance(
+            self._frame, self._segments[segment], T_world_camera, self.options.min_inliers
+        )
 
     def _is_continuous(self, T_world_camera: Array) -> bool:
         """Return whether the camera moved from the pose of the frame before to this near one.
@@ -605,10 +692,7 @@ class Tracker:
             return None
         # 6. Update the noise estimate, compare the appearance, and note which features show which landmarks.
         self.noise.add(observed, inliers, accepted)
-        can_compare = attempt.is_recognised and self._plugins.features is None
-        if can_compare and not has_predicted_appearance(
-            self._frame, segment_map, T_world_camera, min_inliers
-        ):
+        if attempt.is_recognised and not self._looks_right(T_world_camera, attempt.segment):
             return None
         landmarks = np.full(len(view.features), NO_LANDMARK)
         landmarks[matches.features[inliers]] = matches.numbers[inliers]
@@ -655,6 +739,7 @@ class Tracker:
             landmarks = self._map.add_keyframe(posed.view, T_world_camera, landmarks, self.noise.noise)
             self.keyframes += 1
             keyframe_inliers = posed.inliers
+        self._map.set_last(T_world_camera, timestamp_s)
         # 3. Move all landmarks by the change of the readout time; this image was fused with the old time.
         for segment_map in self._segments.values():
             segment_map.change_readout(self._pending_readout_s)
@@ -737,6 +822,7 @@ class Tracker:
     def _add_first_keyframe(self, view: View, T_world_camera: Array) -> Rows:
         """Add the first keyframe of the present segment; return the landmark of each feature."""
         none = np.full(len(view.features), NO_LANDMARK)
+        self._map.set_last(T_world_camera, view.timestamp_s)
         return self._map.add_keyframe(view, T_world_camera, none, self.noise.noise)
 
     def _lose(self, match_count: int) -> TrackedFrame:
@@ -791,20 +877,43 @@ class Tracker:
         there = self._verify(view, T_other_camera, attempt, answer)
         if there is None:
             return
-        # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
+        # 2. Leave out a place that the camera cannot have reached or that is not the only one of its kind.
         T_other_present = orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
-        previous = self._state.join_candidate
-        self._state = replace(self._state, join_candidate=(best.segment, T_other_present))
-        if previous is None or previous[0] != best.segment:
+        reach, begin = self._reach_of_join(best.segment, T_other_present)
+        alias = yield from self._find_alias(there, attempt)
+        position = there.T_world_camera[:3, 3]
+        if alias is not None and not reach.separates(begin, begin + alias - position):
             return
-        apart_m, apart_deg = pose_difference(previous[1], T_other_present)
-        if apart_m > _MAX_JOIN_DIFFERENCE_M or apart_deg > MAX_JOIN_DIFFERENCE_DEG:
+        # 3. Keep the measurement as the candidate; go on only if the candidate before it agrees.
+        here, previous = posed.T_world_camera[:3, 3], self._state.join_candidate
+        is_confirmed = previous is not None and previous.agrees_with(best.segment, T_other_present)
+        first_position = previous.first_position if previous is not None and is_confirmed else here
+        candidate = _JoinCandidate(
+            segment=best.segment, T_other_present=T_other_present, first_position=first_position
+        )
+        self._state = replace(self._state, join_candidate=candidate)
+        if not is_confirmed:
             return
-        # 3. Move the newer of the two segments into the older one, whose poses stay as they are.
+        # 4. If the camera cannot have moved there, the place may be another one that looks the same.  Two
+        #    such places do not overlap: wait until the camera has moved farther than they can be apart.
+        is_reached = reach.excess(begin) <= REACH_DEPTH_SHARE * attempt.distance_to(position)
+        if not is_reached and np.linalg.norm(here - first_position) < reach.farthest(begin):
+            return
+        # 5. Move the newer of the two segments into the older one, whose poses stay as they are.
         if best.segment < present:
             self._join(present, best.segment, T_other_present)
         else:
             self._join(best.segment, present, inverse(T_other_present))
+
+    def _reach_of_join(self, other: int, T_other_present: Array) -> tuple[Reach, Array]:
+        """Return where the newer of two segments can begin in the older one, and where it would by a join.
+
+        *T_other_present* is ``(4, 4)``, the position ``(3,)``.
+        """
+        present = self._state.segment
+        older, newer = (self._segments[number].trajectory() for number in sorted((other, present)))
+        T_older_newer = T_other_present if other < present else inverse(T_other_present)
+        return reach_at_begin(older, newer), transform(T_older_newer, newer.positions[:1])[0]
 
     def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
         """Move all of *segment*, the newer one, into the map of *into*, which keeps its world.

@@ -94,12 +94,12 @@ def test_a_segment_that_reaches_a_known_place_is_joined_in_the_unit_of_the_older
     tracker.rescale(3.0)  # so that the units differ
     rows = {row / 10: row for row in range(8)}
 
-    # The cut: 26 frames on, where nothing of before is in view; then the way back to it.
+    # Not observed for 5 s: 52 frames on, where nothing of before is in view; then the way back to it.
     back = list(range(60, 3, -1))
     done, seen_there, unjoined_there = [], 0, 0
     for number, row in enumerate(back):
-        rows[round(2.0 + number / 10, 6)] = row
-        step = tracker.prepare(frame(row, 2.0 + number / 10))
+        rows[round(6.0 + number / 10, 6)] = row
+        step = tracker.prepare(frame(row, 6.0 + number / 10))
         while isinstance(step, PoseQuery):
             answer = solve(step)
             if step.against == "segment" and answer[1] >= max(40, 0.5 * len(step.correspondences)):
@@ -125,10 +125,10 @@ def test_an_older_place_that_is_seen_again_moves_what_drifted_away_from_it() -> 
     there = run_all(tracker, (frame(row, row / 10) for row in range(45)))
     step_of = position(there[20])[0] / 20
 
-    # The left of these pictures shows rows 5 and more: the camera is 40 rows behind where it believes to be.
+    # The left of these pictures shows rows 22 and more: the estimate has drifted by 23 rows.
     def both(row: int) -> Frame:
-        here, before = frame(row, row / 10), frame(row - 40, 0.0)
-        return replace(here, rgb=np.concatenate([before.rgb[:, :200], here.rgb[:, 200:]], axis=1))
+        here, before = frame(row, row / 10), frame(row - 23, 0.0)
+        return replace(here, rgb=np.concatenate([before.rgb[:, :150], here.rgb[:, 150:]], axis=1))
 
     run_all(tracker, (both(row) for row in range(45, 58)))
 
@@ -136,7 +136,7 @@ def test_an_older_place_that_is_seen_again_moves_what_drifted_away_from_it() -> 
     assert tracker.length_factor == pytest.approx(tracker.loop_scales[0])
     path = tracker.trajectory()
     assert path.positions[0] == pytest.approx(np.zeros(3), abs=2 * step_of)
-    assert path.positions[-1, 0] < 30 * step_of  # and not 57
+    assert path.positions[-1, 0] < 47 * step_of  # and not 57
 
 
 def position(tracked: TrackedFrame) -> Array:

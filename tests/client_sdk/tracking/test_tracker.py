@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
@@ -94,12 +96,30 @@ def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its
     tracker = Tracker(FrontEndOptions(segment_after=3))
     run_all(tracker, map(frame, range(25)))
 
-    while_covered = run_all(tracker, (covered(frame(row)) for row in range(30)))
-    found = run(tracker, frame(2))
+    while_covered = run_all(tracker, (covered(frame(row)) for row in range(25, 65)))
+    found = run(tracker, replace(frame(2), timestamp_s=8.0))
 
     assert all(tracked.lost for tracked in while_covered)
     assert_at(found, 2)
     assert found.segment == 0
+
+
+@pytest.mark.parametrize("tracker", [Tracker(), MonocularTracker()], ids=["depth", "one lens"])
+def test_a_place_that_the_camera_cannot_have_reached_is_not_recognised_until_it_can(
+    tracker: Tracker | MonocularTracker,
+) -> None:
+    """Another place looks the same."""
+    shown = frame if isinstance(tracker, Tracker) else functools.partial(frame_at, depth=False)
+    run_all(tracker, map(shown, range(30)))
+    run_all(tracker, (covered(shown(row)) for row in range(30, 33)))
+
+    soon = run(tracker, replace(shown(2), timestamp_s=3.3))
+    run_all(tracker, (covered(shown(row)) for row in range(34, 64)))
+    later = run(tracker, replace(shown(2), timestamp_s=9.0))
+
+    assert soon.lost
+    assert not later.lost
+    assert later.segment == 0
 
 
 def test_a_camera_that_moves_half_a_metre_between_two_images_is_tracked() -> None:
@@ -282,4 +302,4 @@ def test_a_place_is_recognised_though_something_near_hides_most_of_it() -> None:
     rgb, depth_m = here.rgb.copy(), here.depth_m.copy()
     rgb[:, 80:], depth_m[:, 80:] = hand.rgb[:, 80:], 0.4
 
-    assert_at(run(tracker, replace(here, timestamp_s=2.8, rgb=rgb, depth_m=depth_m)), 12)
+    assert_at(run(tracker, replace(here, timestamp_s=8.0, rgb=rgb, depth_m=depth_m)), 12)
