@@ -207,13 +207,13 @@ def make_corridor(seed: int) -> World:
     return World(tuple(faces), world.textures)
 
 
-def corridor_path(seed: int) -> Trajectory:
+def corridor_path(seed: int, frames: int = CORRIDOR_FRAMES) -> Trajectory:
     """Return the path of a camera that drives along a corridor at a constant speed, and sways a little."""
     rng = np.random.default_rng([seed, 5])
-    stamps_s = np.arange(CORRIDOR_FRAMES) / RATE_HZ
+    stamps_s = np.arange(frames) / RATE_HZ
     # x of the camera points to the right (-y of the world), y down (-z), and z along the corridor (x).
     R_world_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    poses = swaying(CORRIDOR_FRAMES, np.full(3, SWAY_DEG), SWAY_PERIOD_S, rng)
+    poses = swaying(frames, np.full(3, SWAY_DEG), SWAY_PERIOD_S, rng)
     poses[:, :3, :3] = R_world_camera @ poses[:, :3, :3]
     poses[:, 0, 3] = 1.0 + rng.uniform(*CORRIDOR_SPEED_M_S) * stamps_s
     poses[:, 1, 3] = 0.5 * DEPTH_M + rng.uniform(-0.3, 0.3) + 0.05 * np.sin(stamps_s)
