@@ -1,9 +1,9 @@
-"""A file whose blocks are given back to a full disk, so that a robot can still be cut off.
+"""Reserve disk space with a file, so that an operator can still revoke a robot when the disk is full.
 
-The reserve is a file with blocks and no meaning.  When the disk is full, a writer shrinks the reserve by what
-it is going to write, and writes as always: to a temporary file that takes the name of the old file.  If
-another program takes the blocks first, the writer shrinks the reserve again.  Once too little is left, the
-write fails and the old file stays as it was.
+The file has allocated blocks and no content that matters.  When the disk is full, a writer shrinks the file
+by the size of what it writes, then writes as usual: to a temporary file that replaces the old one.  If another
+program takes the blocks first, the writer shrinks the file again.  When too little is left, the write fails
+and the old file stays as it was.
 """
 
 from __future__ import annotations

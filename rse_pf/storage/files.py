@@ -25,11 +25,11 @@ __all__ = [
 OWNER_ONLY = 0o600
 """Mode of a file that holds a secret."""
 TEMPORARY_PREFIX = ".part-"
-"""Names of files that a writer left behind when it was killed begin so."""
-_BY_UMASK = 0o666
-_OTHERS = 0o077
-_MAX_BYTES = 1 << 20
-_MAX_DOCUMENT_BYTES = 16 << 20
+"""Prefix of temporary files; a writer that is killed leaves one behind."""
+_BY_UMASK = 0o666  # mode of other files, from which the umask is taken
+_OTHERS = 0o077  # bits of a mode that give permissions to group or others
+_MAX_BYTES = 1 << 20  # of a file with a secret: a longer one is a mistake of its path
+_MAX_DOCUMENT_BYTES = 16 << 20  # of a JSON document that is read as a whole
 
 
 def check_exists(path: Path | str, hint: str) -> None:

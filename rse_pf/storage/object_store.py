@@ -45,7 +45,7 @@ _SHARD = "+"  # begins the names of subfolders for the objects of a robot, by th
 _LOCK = ".lock-"  # begins the names of lock files
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _WRITE_TRIES = 8
-# A folder that changed within this time before it was read may change again at the same time of change.
+# A folder that was read sooner than this after its last change may change again without a newer time stamp.
 _UNSETTLED_NS = 100_000_000
 _MAX_MEASURED = 100_000
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
@@ -97,7 +97,7 @@ class ObjectStore(Protocol):
         """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
 
     def folders(self, prefix: str) -> Iterator[str]:
-        """Yield, sorted, what stands between *prefix*, which ends with /, and the next slash in names."""
+        """Yield, sorted, the names of the folders directly below the folder *prefix*, which ends with /."""
 
     def usage(self, prefix: str) -> Usage:
         """Return the usage of the objects below the folder *prefix*, which ends with a slash."""
@@ -121,7 +121,7 @@ class PresigningStore(Protocol):
 
 
 def charge_of(size: int) -> int:
-    """Return for how many bytes of a quota an object of *size* bytes counts."""
+    """Return how many bytes of a quota an object of *size* bytes uses."""
     return max(size, MIN_CHARGE_BYTES)
 
 
