@@ -59,13 +59,13 @@ def commit_merge(
     show(
         f"{into} is now version {version.number}, {version.id[:12]}: "
         f"{counted(version.keyframes, 'keyframe')}, {counted(version.points, 'point')}, "
-        f"{counted(reply.merges, 'link')} between maps, "
-        f"{counted(reply.loops, 'loop')}",
+        f"{counted(reply.merges, 'loop closure')} between maps, "
+        f"{counted(reply.loops, 'loop closure')} within maps",
         _row("joined", ", ".join(joined)),
         *(_row("not joined", f"{name}: {reason}") for name, reason in not_joined),
         *(
             _row(
-                "not linked",
+                "rejected",
                 f"{each['between']}: " + ", ".join(f"{n} {why}" for why, n in each["reasons"].items()),
             )
             for each in refused
@@ -80,7 +80,7 @@ def merge_progress(done: float, what: str) -> None:
 
 
 def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
-    """Return the counts of pairs of keyframes that were not linked, by their maps and reasons."""
+    """Return the counts of pairs of keyframes that were rejected, by their maps and reasons."""
     pairs: dict[str, dict[str, int]] = {}
     for refusal in reply.refused:
         between = " and ".join(dict.fromkeys(names[row] for row in refusal.maps))

@@ -1,7 +1,7 @@
 """Live maps, which robots make together while they drive: ``rse-pf map live`` and ``rse-pf map publish``.
 
-Works on the store, and through it with the owner of the map, which must be reachable from this machine.  An
-owner is started here for the command if no server has the map now; ``list`` and ``show`` start none.
+Works on the store, and through it with the map server of the map, which must be reachable from this machine.
+If no server has the map now, a map server is started here for the command; ``list`` and ``show`` start none.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["LIVE_ACTIONS", "run_publish"]
 
 _DEADLINE_S = 30.0
-_OWNER_S = 3.0
-"""After this the owner of a map that is only shown counts as gone."""
+_MAP_SERVER_S = 3.0
+"""Time in seconds after which the map server of a map that is only shown counts as lost."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def _show(request: MapRequest, settings: PlatformSettings) -> None:
     settings = request.settings_with_store(settings)
     try:
         without_servers = settings.replace(live={"max_owners": 0})
-        reply = _ask(request, without_servers, "live-show", LiveMapRequest(map=request.name), _OWNER_S)
+        reply = _ask(request, without_servers, "live-show", LiveMapRequest(map=request.name), _MAP_SERVER_S)
     except Busy:
         reply = {}
     if not reply or reply["state"] == "none":
@@ -88,8 +88,8 @@ def _show(request: MapRequest, settings: PlatformSettings) -> None:
     request.print(
         reply,
         f"{'state':<11}{reply['state']}",
-        f"{'owner':<11}{reply['server'] or '-'}",
-        f"{'keyframes':<11}{reply['keyframes']}, {counted(reply['links'], 'link')}",
+        f"{'server':<11}{reply['server'] or '-'}",
+        f"{'keyframes':<11}{reply['keyframes']}, {counted(reply['links'], 'loop closure')}",
         f"{'log':<11}{counted(reply['version'], 'entry')}".replace("entrys", "entries"),
         *(f"{'robot' if row == 0 else '':<11}{robot}" for row, robot in enumerate(robots)),
     )
@@ -136,7 +136,7 @@ def _ask(
     request: MapRequest, settings: PlatformSettings, operation: str, message: LiveRequest,
     deadline_s: float = _DEADLINE_S,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return what the owner of the map answers; raises what it refuses, or Busy."""
+    """Return the answer of the map server; raises what it refuses, or Busy."""
     from rse_pf.server.live_map.lease import map_folder
 
     map_folder(request.tenant, request.name)  # refuse a wrong name first
@@ -152,7 +152,9 @@ async def _with_links(settings: PlatformSettings, act: Callable[[LiveMapClient],
     from rse_pf.server.live_map.client import LiveMapClient
     from rse_pf.server.log import JsonLog
 
-    settings = settings.replace(serving={"log_level": "error"})  # the owner's lines are for a server's log
+    settings = settings.replace(
+        serving={"log_level": "error"}
+    )  # the lines of the map server are for a server's log
     log = JsonLog(level="error", server="operator", wall_clock=time.time).start()
     links = LiveMapClient(
         store=open_data_store(settings), settings=settings, server_id=f"operator-{os.getpid()}",
@@ -166,7 +168,7 @@ async def _with_links(settings: PlatformSettings, act: Callable[[LiveMapClient],
 
 
 def _read(request: MapRequest, settings: PlatformSettings) -> dict[str, Any]:
-    """Return what the log says of a map that has no owner now; raises NotFound."""
+    """Return the state in the log of a map that has no map server now; raises NotFound."""
     from rse_pf.server.live_map.lease import decode_lease, lease_name, map_folder
     from rse_pf.server.live_map.map_server.environment import LIVE_MAP
     from rse_pf.server.live_map.map_server.log import LiveLog

@@ -134,7 +134,7 @@ def merge_in_parts(request: MergeInPartsRequest, settings: PlatformSettings) -> 
     if not request.json:
         show(
             f"{'parts':<11} {result.computed} computed, {result.found} found; "
-            f"{counted(len(result.tiles), 'link')} from aligned clouds; {seconds:.1f} s"
+            f"{counted(len(result.tiles), 'edge')} from aligned clouds; {seconds:.1f} s"
         )
     return code
 
