@@ -1,9 +1,9 @@
 """Reserve disk space with a file, so that an operator can still revoke a robot when the disk is full.
 
 The file has allocated blocks and no content that matters.  When the disk is full, a writer shrinks the file
-by the size of what it writes, then writes as usual: to a temporary file that replaces the old one.  If another
-program takes the blocks first, the writer shrinks the file again.  When too little is left, the write fails
-and the old file stays as it was.
+by the size of what it writes, then writes as usual: to a temporary file that replaces the old one.  If
+another program takes the blocks first, the writer shrinks the file again.  When too little is left, the
+write fails and the old file stays as it was.
 """
 
 from __future__ import annotations
