@@ -20,7 +20,7 @@ from aws_cdk import aws_secretsmanager as secretsmanager
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S
+from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, LOG_DAYS
 from rse_pf.config.resource_names import ResourceNames
 from stacks.assets import staged
 from stacks.findings import acknowledge
@@ -46,7 +46,7 @@ class Canary(Construct):
         )  # fmt: skip
         acknowledge(key, "rse-pf cloud canary replaces it; it can sign for the canary only", "SMG4")
         log = logs.LogGroup(self, "Log", removal_policy=cdk.RemovalPolicy.DESTROY)
-        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
+        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = LOG_DAYS
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         allow(
             role, ["secretsmanager:GetSecretValue"], [key.secret_arn],

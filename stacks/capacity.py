@@ -12,6 +12,7 @@ from aws_cdk import aws_autoscaling as autoscaling
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import ON_DEMAND_SERVERS
 from rse_pf.config.elasticity import instance_types
 from rse_pf.config.schedule import ScheduleEntry, parse_schedule
 from stacks.findings import acknowledge
@@ -74,7 +75,7 @@ class Capacity(Construct):
             ),
             instances_distribution=kind.InstancesDistributionProperty(
                 on_demand_allocation_strategy="prioritized",
-                on_demand_base_capacity=cloud.on_demand_servers,
+                on_demand_base_capacity=ON_DEMAND_SERVERS,
                 on_demand_percentage_above_base_capacity=0 if cloud.spot else _ALL_ON_DEMAND,
                 spot_allocation_strategy="price-capacity-optimized",
             ),

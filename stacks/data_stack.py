@@ -14,6 +14,7 @@ from aws_cdk import region_info
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import DELETED_DAYS, LOG_DAYS
 from rse_pf.config.resource_names import JOURNAL_PREFIX, ResourceNames
 from stacks.findings import acknowledge
 from stacks.replication import Replication
@@ -50,10 +51,10 @@ class DataStack(cdk.Stack):
         synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
         super().__init__(scope, construct_id, env=env, synthesizer=synthesizer, termination_protection=True)
-        deleted = cdk.Duration.days(settings.cloud.deleted_days)
+        deleted = cdk.Duration.days(DELETED_DAYS)
         self.access_logs = self._bucket("AccessLogs", None)
         self.access_logs.add_lifecycle_rule(
-            expiration=cdk.Duration.days(settings.cloud.log_days),
+            expiration=cdk.Duration.days(LOG_DAYS),
             noncurrent_version_expiration=_DAY, abort_incomplete_multipart_upload_after=_DAY,
         )  # fmt: skip
         self.maps = self._bucket("Maps", self.access_logs)
@@ -75,7 +76,7 @@ class DataStack(cdk.Stack):
                 abort_incomplete_multipart_upload_after=_DAY,
             )  # fmt: skip
         self.artifacts.add_lifecycle_rule(
-            prefix=f"{JOURNAL_PREFIX}/", expiration=cdk.Duration.days(settings.cloud.log_days)
+            prefix=f"{JOURNAL_PREFIX}/", expiration=cdk.Duration.days(LOG_DAYS)
         )  # fmt: skip
         self.audit_logs = self._bucket(
             "AuditLogs", self.access_logs, cdk.Duration.days(settings.cloud.audit_days)

@@ -1,4 +1,4 @@
-"""The function that parks the deployment if nobody used it for ``idle_hours``, and resumes it by schedule.
+"""The function that parks the deployment if nobody used it for `IDLE_HOURS`, and resumes it by schedule.
 
 It is called each hour where ``cloud.idle_action`` says so, and at the entries of ``scaling.schedule`` that do
 not lower the number of servers.
@@ -22,7 +22,7 @@ from aws_cdk import aws_scheduler as scheduler
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import RESUME_FIELD, parks_when_idle
+from rse_pf.config.cloud_layout import LOG_DAYS, RESUME_FIELD, parks_when_idle
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 from rse_pf.config.schedule import DAYS, ScheduleEntry, parse_schedule, resuming
 from stacks.assets import staged
@@ -46,7 +46,7 @@ class IdleTimer(Construct):
         super().__init__(scope, construct_id)
         names = ResourceNames(settings.cloud.name)
         log = logs.LogGroup(self, "Log", removal_policy=cdk.RemovalPolicy.DESTROY)
-        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
+        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = LOG_DAYS
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         log.grant_write(role)
         explain(role, LOG_ACTIONS, used_by=f"{BY_AWS}Lambda writes what the function prints")

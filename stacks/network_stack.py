@@ -12,7 +12,7 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import ENDPOINT_SERVICES, zone_count
+from rse_pf.config.cloud_layout import ENDPOINT_SERVICES, LOG_DAYS, zone_count
 from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
 from stacks.firewall import Firewall, front_port, inner_ports, live_range
@@ -138,7 +138,7 @@ class NetworkStack(cdk.Stack):
 
     def _flow_logs(self, settings: PlatformSettings) -> None:
         group = logs.LogGroup(self, "FlowLog", removal_policy=cdk.RemovalPolicy.DESTROY)
-        cast("logs.CfnLogGroup", group.node.default_child).retention_in_days = settings.cloud.log_days
+        cast("logs.CfnLogGroup", group.node.default_child).retention_in_days = LOG_DAYS
         flow = self.vpc.add_flow_log("Flow", destination=ec2.FlowLogDestination.to_cloud_watch_logs(group))
         explain(
             flow, [*LOG_ACTIONS, "logs:DescribeLogStreams"],

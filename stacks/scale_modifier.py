@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from aws_cdk import aws_autoscaling as autoscaling
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
@@ -16,7 +14,7 @@ __all__ = ["ScaleModifier"]
 
 
 class ScaleModifier(Construct):
-    """One CloudWatch alarm and one step policy for each alarm of the policy."""
+    """One CloudWatch alarm and one step scaling policy for each rule of scaling."""
 
     def __init__(
         self,
@@ -26,12 +24,10 @@ class ScaleModifier(Construct):
         group_name: str,
         topic_arn: str,
         settings: PlatformSettings,
-        alarms: Sequence[Alarm] | None = None,
     ) -> None:
-        """Make the *alarms*, by default those of the backend servers' policy."""
         super().__init__(scope, construct_id)
         self._names = ResourceNames(settings.cloud.name)
-        for alarm in alarms_of(settings.scaling) if alarms is None else alarms:
+        for alarm in alarms_of(settings.scaling):
             self._alarm(alarm, group_name, topic_arn, settings.scaling.warm_up_s)
 
     def _alarm(self, alarm: Alarm, group_name: str, topic_arn: str, warm_up_s: int) -> None:

@@ -18,7 +18,7 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import LAMBDA_MEMORY_MB
+from rse_pf.config.cloud_layout import LAMBDA_MEMORY_MB, LOG_DAYS
 from rse_pf.config.front_door import BURST_PATH
 from rse_pf.config.resource_names import KEYS_NAME, ResourceNames
 from rse_pf.scaling.operator_alarms import LAMBDA_TIMEOUT_S
@@ -51,7 +51,7 @@ class ServerlessStack(cdk.Stack):
         names = ResourceNames(settings.cloud.name)
         artifacts = import_bucket(self, names, "artifacts")
         log = logs.LogGroup(self, "Log", removal_policy=cdk.RemovalPolicy.DESTROY)
-        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
+        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = LOG_DAYS
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         allow(
             role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in TRUSTED],

@@ -7,8 +7,12 @@ from rse_pf.config.settings import PlatformSettings
 __all__ = [
     "CANARY_MB",
     "CANARY_PERIOD_S",
+    "DELETED_DAYS",
     "ENDPOINT_SERVICES",
+    "IDLE_HOURS",
     "LAMBDA_MEMORY_MB",
+    "LOG_DAYS",
+    "ON_DEMAND_SERVERS",
     "RESUME_FIELD",
     "parks_when_idle",
     "zone_count",
@@ -16,8 +20,18 @@ __all__ = [
 
 # Memory of the serverless PnP: AWS gives it one whole vCPU, and a command uses no second one.
 LAMBDA_MEMORY_MB = 1769
-CANARY_MB, CANARY_PERIOD_S = 512, 60
-"""Memory of the canary's function, and the time between two calls."""
+# Memory of the canary's function: a third of a vCPU, with which a start and one pose fit into its time limit.
+CANARY_MB = 512
+# Time between two calls of the canary: one in each period of its alarm.
+CANARY_PERIOD_S = 60
+# Retention of logs: long enough to look into an incident of last month; the audit log has `cloud.audit_days`.
+LOG_DAYS = 30
+# An object that was overwritten or deleted can be restored for as long as the logs say who did it.
+DELETED_DAYS = 30
+# Servers that are never Spot instances: robots have one place to go when AWS takes all others back.
+ON_DEMAND_SERVERS = 1
+# Hours without robots after which a deployment is idle: a whole day, so that a night alone parks nothing.
+IDLE_HOURS = 24
 ENDPOINT_SERVICES = {"monitoring": "monitor", "autoscaling": "scale modifier"}
 """The interface endpoints of the VPC: the service of AWS, and the box of Fig. 2 that uses it.
 
@@ -32,7 +46,7 @@ def zone_count(settings: PlatformSettings) -> int:
 
 
 def parks_when_idle(settings: PlatformSettings) -> bool:
-    """Return whether the deployment ends its servers when nobody has used it for ``cloud.idle_hours``.
+    """Return whether the deployment ends its servers when nobody has used it for `IDLE_HOURS`.
 
     A platform for more than trials, which TLS or a schedule shows, does so only if its operator says so.
     """

@@ -1,41 +1,24 @@
 """Decide when the platform grows, shrinks or replaces a server: the paper's scale modifier as a pure rule.
 
 `decide` takes measurements and the time, keeps no state between calls, and returns what the caller has to do.
-A period without a sample is no reason to act.  `rse_pf.scaling.alarms` describes the same policy to
-CloudWatch; a test compares the two, in both profiles.
+A period without a sample is no reason to act.  The rules are those of `rse_pf.scaling.rules`; CloudWatch
+applies the same ones on AWS, and a test compares the two, in both profiles.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from rse_pf.config import ScalingSettings
-from rse_pf.config.elasticity import IDLE_CPU_PERCENT, UNDERUSED_CPU_PERCENT
-from rse_pf.scaling.profile import Cadence, cadence_of
+from rse_pf.scaling.profile import cadence_of
+from rse_pf.scaling.rules import Sample, ScalingRule, rules_of
 
-__all__ = ["BIG_STEP", "STEP", "Action", "FleetState", "Kind", "Sample", "decide", "find_rule_starts"]
-
-STEP, BIG_STEP = 1, 2
-"""Servers added above ``scaling.busy_cpu_percent``, and above ``scaling.very_busy_cpu_percent``."""
+__all__ = ["Action", "FleetState", "Kind", "decide", "find_rule_starts"]
 
 Kind = Literal["grow", "shrink", "replace", "stay"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sample:
-    """Measurements of one whole period, over all servers that are past their warm-up.
-
-    ``start_s`` is the begin of the period, so a sample covers ``[start_s, start_s + period)``.
-    """
-
-    start_s: float
-    cpu_percent: float
-    requests: float
-    robots_per_server: float = 0.0
-    queue_ms: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,17 +42,6 @@ class Action:
     servers: int = 0
     names: tuple[str, ...] = ()
     reason: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Rule:
-    """A condition on *samples* samples in a row, and by how many servers it changes the fleet."""
-
-    name: str
-    samples: int
-    holds: Callable[[Sample], bool]
-    change: Callable[[Sample], int]
-    reason: Callable[[Sample], str]
 
 
 def decide(
@@ -119,10 +91,10 @@ def decide(
         return (*replacements, Action(kind="stay", reason="this period has led to an action already"))
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
     if since_s is None:
-        since_s = _find_starts(by_period, ended, settings, cadence, period_s, {})
+        since_s = _find_starts(by_period, ended, settings, period_s, {})
     acting = [
         rule
-        for rule in _rules(settings, cadence)
+        for rule in rules_of(settings)
         if rule.name in since_s
         and (ended - _periods(since_s[rule.name], period_s)) % cadence.repeat == 0
         and ended - 1 in by_period
@@ -147,84 +119,21 @@ def find_rule_starts(
         compress: As for `decide`.
         before: What this returned a period ago; None at the first call.
     """
-    cadence = cadence_of(settings)
-    period_s = cadence.period_s / compress
+    period_s = cadence_of(settings).period_s / compress
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
-    return _find_starts(by_period, _periods(now_s, period_s), settings, cadence, period_s, before or {})
-
-
-def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
-    """Return the rules that are on, those that grow first."""
-    most_robots, most_queue_ms = settings.max_robots_per_server, settings.max_queue_ms
-    rules = [
-        _Rule(
-            name="busy",
-            samples=cadence.busy,
-            holds=lambda sample: sample.cpu_percent >= settings.busy_cpu_percent,
-            change=lambda sample: BIG_STEP if sample.cpu_percent >= settings.very_busy_cpu_percent else STEP,
-            reason=lambda sample: f"CPU at {sample.cpu_percent:.0f} %",
-        )
-    ]
-    if most_robots:
-        rules.append(
-            _Rule(
-                name="crowded",
-                samples=cadence.busy,
-                holds=lambda sample: sample.robots_per_server >= most_robots,
-                change=lambda sample: STEP,
-                reason=lambda sample: f"{sample.robots_per_server:.0f} robots on each server",
-            )
-        )
-    if most_queue_ms:
-        rules.append(
-            _Rule(
-                name="queueing",
-                samples=cadence.busy,
-                holds=lambda sample: sample.queue_ms >= most_queue_ms,
-                change=lambda sample: STEP,
-                reason=lambda sample: f"commands wait {sample.queue_ms:.0f} ms",
-            )
-        )
-
-    def spare(sample: Sample, share: float) -> bool:
-        robots = not most_robots or sample.robots_per_server < share * most_robots
-        return robots and (not most_queue_ms or sample.queue_ms < share * most_queue_ms)
-
-    rules.append(
-        _Rule(
-            name="idle",
-            samples=cadence.idle,
-            holds=lambda sample: (
-                sample.requests == 0 and sample.cpu_percent < IDLE_CPU_PERCENT and spare(sample, 1.0)
-            ),
-            change=lambda sample: -1,
-            reason=lambda sample: f"idle for {settings.idle_s} s",
-        )
-    )
-    if cadence.underused:
-        rules.append(
-            _Rule(
-                name="underused",
-                samples=cadence.underused,
-                holds=lambda sample: sample.cpu_percent < UNDERUSED_CPU_PERCENT and spare(sample, 0.5),
-                change=lambda sample: -1,
-                reason=lambda sample: f"CPU at {sample.cpu_percent:.0f} %, low for {settings.underused_s} s",
-            )
-        )
-    return rules
+    return _find_starts(by_period, _periods(now_s, period_s), settings, period_s, before or {})
 
 
 def _find_starts(
     by_period: Mapping[int, Sample],
     ended: int,
     settings: ScalingSettings,
-    cadence: Cadence,
     period_s: float,
     before: Mapping[str, float],
 ) -> dict[str, float]:
     """Return since when each rule holds; a run as long as the history began when *before* says."""
     starts_s, oldest = {}, min(by_period, default=ended)
-    for rule in _rules(settings, cadence):
+    for rule in rules_of(settings):
         first = ended
         while first - 1 in by_period and rule.holds(by_period[first - 1]):
             first -= 1
@@ -235,14 +144,14 @@ def _find_starts(
 
 
 def _scale(
-    acting: Sequence[_Rule], newest: Sample | None, fleet: FleetState, settings: ScalingSettings
+    acting: Sequence[ScalingRule], newest: Sample | None, fleet: FleetState, settings: ScalingSettings
 ) -> Action:
     if newest is None or not acting:
         return Action(kind="stay", reason="neither busy nor idle")
-    growing = [rule for rule in acting if rule.change(newest) > 0]
+    growing = [rule for rule in acting if rule.grows]
     if growing:
         rule = max(growing, key=lambda growing_rule: growing_rule.change(newest))
-        reason = rule.reason(newest)
+        reason = rule.explain(newest)
         target = min(settings.max_servers, fleet.servers - fleet.warming + rule.change(newest))
         more = target - fleet.servers
         if more > 0:
@@ -251,7 +160,7 @@ def _scale(
         return Action(
             kind="stay", reason=f"{reason}, but {'at scaling.max_servers' if bound else 'still warming up'}"
         )
-    reason = acting[0].reason(newest)
+    reason = acting[0].explain(newest)
     if fleet.warming:
         return Action(kind="stay", reason=f"{reason}, but still warming up")
     if fleet.servers > settings.min_servers:

@@ -7,7 +7,8 @@ import random
 from rse_pf.config import ScalingSettings
 from rse_pf.extensions.fleet_page.feeds.events import event_sentence
 from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
-from rse_pf.scaling.policy import FleetState, Sample, decide
+from rse_pf.scaling.policy import FleetState, decide
+from rse_pf.scaling.rules import Sample
 
 SETTINGS = ScalingSettings()
 PERIOD_S = SETTINGS.period_s

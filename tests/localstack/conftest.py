@@ -19,7 +19,7 @@ DEPLOYED = ("Network", "Data", "Backend")
 """Boxes that the community edition deploys; `test_deployment` says why the others fail."""
 SETTINGS = PlatformSettings().replace(
     cloud={"image_parameter": "/debian/image"},
-    scaling={"profile": "fast", "max_robots_per_server": 50, "max_queue_ms": 40, "warm_up_s": 0},
+    scaling={"profile": "fast", "max_robots_per_server": 50, "warm_up_s": 0},
 )
 """All alarms; LocalStack lets nobody write parameters below /aws, where Debian's are."""
 _MINUTES = 5 * 60.0

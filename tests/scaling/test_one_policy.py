@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 
 from rse_pf.config import ScalingSettings
 from rse_pf.scaling.alarms import NAMESPACE, Alarm, alarms_of
-from rse_pf.scaling.policy import FleetState, Sample, decide, find_rule_starts
+from rse_pf.scaling.policy import FleetState, decide, find_rule_starts
 from rse_pf.scaling.profile import cadence_of
+from rse_pf.scaling.rules import Sample
 
 Point = dict[str, float] | None
 Run = list[int]
@@ -102,7 +103,6 @@ class Local:
                     cpu_percent=point["cpu"],
                     requests=point["requests"],
                     robots_per_server=point["robots"],
-                    queue_ms=point["queue"],
                 )
             )
         warming = sum(now_s - each < self.scaling.warm_up_s for each in self.launched)
@@ -125,7 +125,7 @@ def run(side: Cloud | Local, loads: list[float | None], *, closed_loop: bool) ->
         if load is not None:
             shared = load / len(side.launched) if closed_loop else load
             point = {
-                "cpu": min(100.0, shared), "requests": load, "robots": shared, "queue": shared / 2,
+                "cpu": min(100.0, shared), "requests": load, "robots": shared,
             }  # fmt: skip
         side.period(point, now_s)
         trace.append(len(side.launched))
@@ -150,13 +150,13 @@ def walks(draw: st.DrawFn) -> list[float | None]:
 
 
 SCALINGS = st.builds(
-    lambda profile, idle_s, underused_s, low, more, warm, robots, queue: ScalingSettings(
+    lambda profile, idle_s, underused_s, low, more, warm, robots: ScalingSettings(
         profile=profile, idle_s=idle_s, underused_s=underused_s, min_servers=low, max_servers=low + more,
-        warm_up_s=warm, max_robots_per_server=robots, max_queue_ms=queue,
+        warm_up_s=warm, max_robots_per_server=robots,
     ),
     st.sampled_from(["paper", "fast"]), st.sampled_from([60, 180, 300]), st.sampled_from([0, 120, 900]),
     st.integers(1, 3), st.integers(0, 8), st.sampled_from([0, 30, 60, 90, 180]),
-    st.sampled_from([0, 60]), st.sampled_from([0.0, 32.0]),
+    st.sampled_from([0, 60]),
 )  # fmt: skip
 
 
@@ -265,8 +265,8 @@ def test_the_fast_profile_needs_three_samples_of_ten_seconds_of_the_servers_own_
 
 
 def test_limits_that_are_on_keep_servers_that_they_would_add_again() -> None:
-    scaling = ScalingSettings(max_robots_per_server=60, max_queue_ms=32.0)
+    scaling = ScalingSettings(max_robots_per_server=60)
     expressions = {alarm.name: alarm.expression for alarm in alarms_of(scaling)}
 
-    assert expressions["idle"] == "IF(requests == 0 AND cpu < 20 AND robots < 60 AND queue < 32, 1, 0)"
-    assert expressions["underused"] == "IF(cpu < 15 AND robots < 30 AND queue < 16, 1, 0)"
+    assert expressions["idle"] == "IF(requests == 0 AND cpu < 20 AND robots < 60, 1, 0)"
+    assert expressions["underused"] == "IF(cpu < 15 AND robots < 30, 1, 0)"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.config import ScalingSettings
-from rse_pf.scaling.policy import Action, FleetState, Sample, decide, find_rule_starts
+from rse_pf.scaling.policy import Action, FleetState, decide, find_rule_starts
+from rse_pf.scaling.rules import Sample
 
 SETTINGS = ScalingSettings(min_servers=1)
 
@@ -82,17 +83,9 @@ def test_broken_servers_are_replaced_whatever_the_load() -> None:
     assert scale.kind == "stay"
 
 
-@pytest.mark.parametrize(
-    ("settings", "sample"),
-    [
-        (ScalingSettings(max_robots_per_server=50), {"robots_per_server": 50.0}),
-        (ScalingSettings(max_queue_ms=20.0), {"queue_ms": 20.0}),
-    ],
-)
-def test_crowds_and_queues_grow_the_fleet_when_switched_on(
-    settings: ScalingSettings, sample: dict[str, float]
-) -> None:
-    samples = [Sample(start_s=60.0 * i, cpu_percent=30, requests=1, **sample) for i in range(2)]
+def test_too_many_robots_grow_the_fleet_when_a_limit_is_set() -> None:
+    settings = ScalingSettings(max_robots_per_server=50)
+    samples = [Sample(start_s=60.0 * i, cpu_percent=30, requests=1, robots_per_server=50.0) for i in range(2)]
 
     assert decide(samples, FleetState(servers=3), settings, now_s=120.0)[-1].servers == 1
     assert decide(samples, FleetState(servers=3), SETTINGS, now_s=120.0)[-1].kind == "stay"

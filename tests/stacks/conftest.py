@@ -26,8 +26,9 @@ PUBLIC = PlatformSettings.from_dict(
         },
         "data": {"enabled": True},
         "scaling": {
-            "busy_cpu_percent": 60.0, "max_servers": 8, "min_servers": 3, "idle_s": 420, "max_queue_ms": 40,
-            "profile": "fast", "schedule": "mon 08:00 min 8", "time_zone": "Asia/Seoul",
+            "busy_cpu_percent": 60.0, "max_servers": 8, "min_servers": 3, "idle_s": 420,
+            "max_robots_per_server": 100, "profile": "fast",
+            "schedule": "mon 08:00 min 8", "time_zone": "Asia/Seoul",
         },
         "serving": {"port": 9001, "control_port": 9002, "rosbridge": True},
     }

@@ -62,7 +62,7 @@ def well(assembly: Assembly, period_s: int) -> dict[str, list[float]]:
         "HealthyHostCount": [floor] * 3, "UnHealthyHostCount": [0.0] * 3,
         "GroupDesiredCapacity": [floor], "GroupInServiceInstances": [floor],
         "HTTPCode_Target_5XX_Count": [0.0], "HTTPCode_ELB_5XX_Count": [0.0],
-        "Robots": [4.0] * reports, "Requests": [200.0], "QueueMs": [1.0], "CPUUtilization": [40.0, 50.0],
+        "Robots": [4.0] * reports, "Requests": [200.0], "CPUUtilization": [40.0, 50.0],
         CPU: [40.0], "BlockedRequests": [1.0],
         "Invocations": [1.0], "Errors": [0.0], "Throttles": [0.0], "Duration": [300.0, 400.0],
     }  # fmt: skip
@@ -95,9 +95,8 @@ FAULTS: dict[str, list[dict[str, list[float] | None]]] = {
     "canary": [{"Errors": [1.0]}, {"Invocations": None, "Errors": None}, {"Invocations": None}],
     "busy": [{"CPUUtilization": [99.0], CPU: [99.0]}],
     "idle": [{"Requests": [0.0], "CPUUtilization": [2.0], CPU: [2.0]}],
-    "underused": [{"CPUUtilization": [2.0], CPU: [2.0], "Robots": [1.0], "QueueMs": [0.0]}],
+    "underused": [{"CPUUtilization": [2.0], CPU: [2.0], "Robots": [1.0]}],
     "crowded": [{"Robots": [1e4]}],
-    "queueing": [{"QueueMs": [1e4]}],
 }
 """Alarm to its faults: what a fault changes in a period; None is missing data."""
 QUIET_WHEN_PARKED = ("few-servers", "balancer-errors", "silent-agent", "canary", "unhealthy", "store")
@@ -226,7 +225,7 @@ def test_the_canary_does_not_keep_ten_servers(
     periods = [
         {
             **{name: [one.cloud[name], *[unloaded[name]] * 9] for name in unloaded},
-            "QueueMs": [0.0], "CPUUtilization": [17.0] * 10, CPU: [17.0] * 10,
+            "CPUUtilization": [17.0] * 10, CPU: [17.0] * 10,
         }
         for one in traffic
     ]  # fmt: skip

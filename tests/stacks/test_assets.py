@@ -49,7 +49,7 @@ def test_the_same_input_gives_the_same_sums_and_another_setting_others(assets: P
     assert digest("a") == digest("b")
     assert digest("a") != digest("c", serving={"workers": 3})
     assert digest("a") == digest(
-        "d", scaling={"max_servers": 9}, cloud={"log_days": 9, "allow_insecure": True}
+        "d", scaling={"max_servers": 9}, cloud={"audit_days": 9, "allow_insecure": True}
     )
 
 

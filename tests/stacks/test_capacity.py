@@ -61,14 +61,14 @@ def test_a_warm_pool_holds_exactly_its_stopped_servers() -> None:
 
 
 def test_spot_servers_stand_on_a_floor_on_demand_and_are_replaced_before_they_are_lost() -> None:
-    cloud = {"spot": True, "on_demand_servers": 2, "other_instance_types": "c6i.large m7i.large"}
+    cloud = {"spot": True, "other_instance_types": "c6i.large m7i.large"}
     (group,) = resources(cloud=cloud)["AutoScalingGroup"]
     policy = group["MixedInstancesPolicy"]
 
     assert "LaunchTemplate" not in group
     assert group["CapacityRebalance"] is True
     assert policy["InstancesDistribution"] == {
-        "OnDemandAllocationStrategy": "prioritized", "OnDemandBaseCapacity": 2,
+        "OnDemandAllocationStrategy": "prioritized", "OnDemandBaseCapacity": 1,
         "OnDemandPercentageAboveBaseCapacity": 0, "SpotAllocationStrategy": "price-capacity-optimized",
     }  # fmt: skip
     assert policy["LaunchTemplate"]["Overrides"] == [

@@ -12,8 +12,9 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import ConfigurationError
-from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
+from rse_pf.scaling.alarms import Alarm, Metric, alarms_of
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S
+from rse_pf.scaling.rules import ScalingStep
 
 Assembly = Any
 

@@ -27,7 +27,7 @@ from rse_pf.aws.lifecycle.parking import (
     write_note,
 )
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.config.cloud_layout import RESUME_FIELD
+from rse_pf.config.cloud_layout import IDLE_HOURS, RESUME_FIELD
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 
@@ -41,21 +41,21 @@ _HOUR_S = 3600
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hour:
-    """What the agents told in one hour; None where none of them told anything."""
+    """The metrics of the group in one hour; None where no agent published any."""
 
     requests: float | None
     robots: float | None
     """Mean over the hour of the robots on all servers."""
 
 
-def is_idle(hours: Sequence[Hour], *, idle_hours: int) -> bool:
-    """Return whether nobody used the platform in any of the last *idle_hours* of *hours*, oldest first.
+def is_idle(hours: Sequence[Hour]) -> bool:
+    """Return whether nobody used the platform in any of the last `IDLE_HOURS` of *hours*, oldest first.
 
     An hour of which nothing is known is not idle: silent agents are a failure, and a deployment that is
     younger, or was resumed later, has not been idle for so long.
     """
-    last = hours[-idle_hours:]
-    return len(last) >= idle_hours and all(hour.requests == 0 and hour.robots == 0 for hour in last)
+    last = hours[-IDLE_HOURS:]
+    return len(last) == IDLE_HOURS and all(hour.requests == 0 and hour.robots == 0 for hour in last)
 
 
 def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime, topic: str) -> str:
@@ -65,15 +65,15 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
         ConfigurationError: AWS refused.
         StoreError: AWS does not answer.
     """
-    names, cloud = ResourceNames(settings.cloud.name), settings.cloud
+    names = ResourceNames(settings.cloud.name)
     groups, note = read_sizes(account, names), read_note(account, names)
     if note is not None and (note.by != "timer" or not any(group.max_servers for group in groups.values())):
         return f"{names.prefix} is parked since {note.since}"
-    hours = _read_hours(account, names, groups, cloud.idle_hours, now)
-    if not is_idle(hours, idle_hours=cloud.idle_hours):
-        return f"{names.prefix} was used within {cloud.idle_hours} hours, or nobody told"
-    message = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
-    # Told before it is done: once the groups are empty, a repetition finds the deployment parked and ends.
+    hours = _read_hours(account, names, groups, IDLE_HOURS, now)
+    if not is_idle(hours):
+        return f"{names.prefix} was used within {IDLE_HOURS} hours, or some hours have no metrics"
+    message = f"{names.prefix} was idle for {IDLE_HOURS} hours and is parked now; rse-pf cloud resume"
+    # Notify before parking: once the groups are empty, a repetition finds the deployment parked and ends.
     account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=message)
     if note is None:
         since = now.isoformat(timespec="seconds")

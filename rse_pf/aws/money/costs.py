@@ -20,6 +20,7 @@ from rse_pf.config.cloud_layout import (
     CANARY_PERIOD_S,
     ENDPOINT_SERVICES,
     LAMBDA_MEMORY_MB,
+    ON_DEMAND_SERVERS,
     zone_count,
 )
 from rse_pf.config.front_door import rate_rules
@@ -184,7 +185,7 @@ def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> lis
     kind, price = settings.cloud.instance_type, prices.server(settings.cloud.instance_type)
     floor, busy = settings.scaling.min_servers, servers_needed(settings, prices, load)
     hours = HOURS * floor + load.hours * (busy - floor)
-    on_demand = settings.cloud.on_demand_servers if settings.cloud.spot else busy
+    on_demand = ON_DEMAND_SERVERS if settings.cloud.spot else busy
     on_demand_hours = HOURS * min(on_demand, floor) + load.hours * (
         min(on_demand, busy) - min(on_demand, floor)
     )

@@ -11,7 +11,7 @@ from rse_pf.cli.cloud.doctor import NO_PACKAGES, check_tools
 from rse_pf.cli.doctor import Finding
 from rse_pf.command_line.options import Action
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import parks_when_idle
+from rse_pf.config.cloud_layout import IDLE_HOURS, parks_when_idle
 from rse_pf.terminal import show
 
 __all__ = ["ACTION", "finish", "show_failed_checks"]
@@ -63,7 +63,7 @@ def finish(account: Account, settings: PlatformSettings) -> int:
     show("      rse-pf cloud status                   servers, robots, alarms, cost")
     show("      rse-pf cloud park                     for the night; rse-pf cloud resume in the morning")
     if parks_when_idle(settings):
-        show(f"it parks itself after {cloud.idle_hours} hours without robots (cloud.idle_hours)")
+        show(f"it parks itself after {IDLE_HOURS} hours without robots (cloud.idle_action)")
     return 0
 
 

@@ -1,8 +1,8 @@
 """The monitor box on one machine: samples of all servers, and their means over whole periods.
 
-A `MonitorSample` is taken about once a second; `Periods` adds them up to the
-`rse_pf.scaling.policy.Sample`s that the policy judges, by the rule with which a report can be checked
-later: a sample speaks for the time since the one before it, and belongs to the period in which the middle
+A `MonitorSample` is taken about once a second; `Periods` combines them into the
+`rse_pf.scaling.rules.Sample`s that the policy evaluates, by the rule with which a report can be checked
+later: a sample stands for the time since the one before it, and belongs to the period in which the middle
 of that time lies.  The functions here are pure: they use no clock and no socket, and a server that does
 not answer has no numbers rather than zeros.
 """
@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from rse_pf.config import ServingSettings
-from rse_pf.scaling.policy import Sample
+from rse_pf.scaling.rules import Sample
 
 __all__ = [
     "MonitorSample",
@@ -30,14 +30,17 @@ __all__ = [
 
 ServerPhase = Literal["starting", "healthy", "unhealthy", "draining"]
 
-_MAX_S, _MIN_S = 1.0, 0.25
-_WHOLE = 0.5
-"""A period of which less than this share was watched gives no sample."""
+# Longest time between two samples, in seconds: the fleet page shows a change within about a second.
+_MAX_INTERVAL_S = 1.0
+# Shortest time between two samples, in seconds: reading all servers more often would take noticeable CPU.
+_MIN_INTERVAL_S = 0.25
+# A period of which less than this share was observed gives no sample: most of its load is unknown.
+_MIN_OBSERVED_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observed:
-    """What a server said of itself at one time, monotonic seconds; ``status`` is its /status page."""
+    """The /status page of a server as ``status``, and when it was read: ``at_s``, in monotonic seconds."""
 
     at_s: float
     status: Mapping[str, Any]
@@ -83,7 +86,7 @@ class MonitorSample:
 
 def sample_interval_s(period_s: float) -> float:
     """Return the time between samples: a whole part of the period, near 1 s, and never below 0.25 s."""
-    return max(period_s / math.ceil(period_s / _MAX_S), _MIN_S)
+    return max(period_s / math.ceil(period_s / _MAX_INTERVAL_S), _MIN_INTERVAL_S)
 
 
 def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -> float:
@@ -151,7 +154,7 @@ def monitor_sample(
 
 
 class Periods:
-    """Samples of the monitor, added up to samples of whole periods; the newest are kept."""
+    """Combines samples of the monitor into samples of whole periods, of which the newest *keep* stay."""
 
     def __init__(self, period_s: float, keep: int) -> None:
         self._period_s = period_s
@@ -160,7 +163,7 @@ class Periods:
         self._before_s: float | None = None
 
     def add(self, sample: MonitorSample) -> bool:
-        """Take *sample* in; return whether a period ended since the one before it."""
+        """Add *sample*; return whether a period ended since the sample before it."""
         before_s, self._before_s = self._before_s, sample.time
         if before_s is None or sample.time <= before_s:
             return False
@@ -177,12 +180,12 @@ class Periods:
         return tuple(
             _period_sample(period * self._period_s, period_samples)
             for period, period_samples in sorted(self._taken.items())
-            if period < ended and _observed_s(period_samples) >= _WHOLE * self._period_s
+            if period < ended and _observed_s(period_samples) >= _MIN_OBSERVED_SHARE * self._period_s
         )
 
 
 def _period_sample(start_s: float, period_samples: Sequence[tuple[float, MonitorSample]]) -> Sample:
-    """Return the sample of one period: means over time, the longest queue, and the sum of the requests."""
+    """Return the sample of one period: means over time, and the sum of the requests."""
     loads = [(since_s, sample) for since_s, sample in period_samples if sample.cpu_percent is not None]
     known_s = _observed_s(period_samples)
     return Sample(
@@ -191,10 +194,9 @@ def _period_sample(start_s: float, period_samples: Sequence[tuple[float, Monitor
         requests=sum(sample.requests for _, sample in period_samples),
         robots_per_server=sum(since_s * sample.robots / sample.servers_count for since_s, sample in loads)
         / known_s,
-        queue_ms=max(sample.queue_ms for _, sample in period_samples),
     )
 
 
 def _observed_s(period_samples: Sequence[tuple[float, MonitorSample]]) -> float:
-    """Return how long the CPU was watched."""
+    """Return for how many seconds of the period the CPU is known."""
     return sum(since_s for since_s, sample in period_samples if sample.cpu_percent is not None)

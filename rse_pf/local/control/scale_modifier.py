@@ -15,7 +15,8 @@ from typing import Any
 
 from rse_pf.config import ScalingSettings
 from rse_pf.local.control.fleet import Fleet, ServerHealth
-from rse_pf.scaling.policy import Action, FleetState, Sample, decide, find_rule_starts
+from rse_pf.scaling.policy import Action, FleetState, decide, find_rule_starts
+from rse_pf.scaling.rules import Sample
 
 __all__ = ["LocalScaleModifier", "bounds_for", "may_start_s", "replace_now"]
 

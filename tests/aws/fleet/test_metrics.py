@@ -77,7 +77,7 @@ def test_every_series_of_an_operator_alarm_that_we_publish_is_published_by_a_ser
 
 
 def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() -> None:
-    settings = PlatformSettings.from_dict({"scaling": {"max_robots_per_server": 9, "max_queue_ms": 40}})
+    settings = PlatformSettings.from_dict({"scaling": {"max_robots_per_server": 9}})
     wanted = {
         metric.metric
         for alarm in alarms_of(settings.scaling)
@@ -86,7 +86,7 @@ def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() ->
     }
     told = datums(ServerMetrics(), ServerMetrics(), "rse-pf", "i-1")
 
-    assert wanted == {"Requests", "Robots", "QueueMs"}
+    assert wanted == {"Requests", "Robots"}
     assert wanted <= set(named(told))
     *of_group, of_server = told
     for each in of_group:

@@ -61,7 +61,7 @@ def test_the_small_profile_costs_less_than_a_hundred_a_month_and_parked_less_tha
         pytest.param(SETTINGS, at(1, fps=0.001), 0.0, id="the floor is paid when hardly anybody asks"),
         pytest.param(SETTINGS, at(60, hours=6.0), 0.1 * 730 / 4, id="further servers in the busy hours only"),
         pytest.param(
-            SETTINGS.replace(cloud={"spot": True, "on_demand_servers": 1}), at(60),
+            SETTINGS.replace(cloud={"spot": True}), at(60),
             0.04 * 730 - 0.06 * 730, id="servers above the on-demand ones are Spot instances",
         ),
         pytest.param(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rse_pf.config import ScalingSettings
 from rse_pf.local.control.fleet import ServerHealth
 from rse_pf.local.control.scale_modifier import LocalScaleModifier, may_start_s, replace_now
-from rse_pf.scaling.policy import Sample
+from rse_pf.scaling.rules import Sample
 
 SCALING = ScalingSettings()
 

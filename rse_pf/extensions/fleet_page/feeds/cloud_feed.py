@@ -233,7 +233,7 @@ def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: fl
 
 
 _SECURE = {"TLS", "HTTPS"}
-_SCALES = ("busy", "idle", "crowded", "queueing")
+_SCALES = ("busy", "idle", "crowded", "underused")
 
 
 def _changes(before: AutoScalingGroup, after: AutoScalingGroup, time_s: float) -> list[dict[str, Any]]:

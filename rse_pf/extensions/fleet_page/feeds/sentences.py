@@ -10,8 +10,8 @@ from typing import Any
 
 from rse_pf.config import ScalingSettings
 from rse_pf.config.elasticity import IDLE_CPU_PERCENT, UNDERUSED_CPU_PERCENT
-from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
+from rse_pf.scaling.rules import BIG_STEP, STEP
 
 __all__ = ["waiting_for"]
 
