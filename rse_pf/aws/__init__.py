@@ -1,5 +1,5 @@
-"""What runs on AWS beside the platform's own code; the only package that imports boto3 and botocore.
+"""The use of AWS services; the only package that imports boto3 and botocore.
 
-Clients, the account and its stacks are here; `fleet` watches servers, `storage` keeps objects, `money`
-counts cost.
+Clients, the account and its stacks are here; `fleet` operates servers, `storage` keeps objects, `lifecycle`
+deploys, parks and removes a deployment, and `canary` asks for a known pose.
 """

@@ -1,8 +1,8 @@
-"""The alarms that call an operator, as data: what is measured, when it is wrong, and what it means.
+"""The alarms that notify an operator, as data: metrics, expression, and meaning.
 
-They notify and scale nothing.  The stacks write them into a template, `rse_pf.aws.money.costs` counts them,
-and each has a chapter of its own in docs/operations.md.  While the platform is parked, it has no servers on
-purpose: alarms about servers then stay quiet, because they compare with the wanted size of the group.
+They scale nothing.  The stacks write them into a template, `rse_pf.extensions.costs.bill` counts them, and
+each has a chapter of its own in docs/operations.md.  A parked platform has no servers on purpose: alarms
+about servers then stay in the state OK, because they compare with the wanted size of the group.
 """
 
 from __future__ import annotations
@@ -27,30 +27,34 @@ __all__ = [
     "operator_alarms",
 ]
 
+# Time limit of one execution of the serverless PnP, in seconds: twice the deadline of a command.
 LAMBDA_TIMEOUT_S = 10
-"""Of one execution of the serverless PnP."""
+# An execution is slow that takes more of its time limit than this share: the next ones may fail by the limit.
 _SLOW_SHARE = 0.8
-"""An execution that takes more of its time-out than this is slow."""
+# Blocked requests in a minute that notify: as many as ten robots send that dial at their full rate.
 _BLOCKED_PER_PERIOD = 100.0
-_PERIOD_S, _LONG_PERIOD_S = 60, 300
-STORE_ERRORS, STORE_PERIOD_S = "StoreErrors", 10
-"""What an agent publishes while the bucket does not answer its server, and how often it looks.
-
-Nothing is published while all is well, so the metric costs nothing then; agents that are silent for another
-reason have an alarm of their own."""
+# Period of most alarms, in seconds: AWS publishes its own metrics each minute.
+_PERIOD_S = 60
+# Shortest period of the alarm on silent agents, in seconds: an agent that restarts misses a sample or two.
+_LONG_PERIOD_S = 300
+# Metric that an agent publishes while the bucket does not answer its server; it costs nothing otherwise.
+STORE_ERRORS = "StoreErrors"
+# Time between two checks of the bucket, in seconds: the shortest period that an alarm may have.
+STORE_PERIOD_S = 10
+# Metric of the workers that a crash in native code ended in a period; an agent does not publish 0.
 NATIVE_CRASHES = "NativeCrashes"
-"""Workers of a server that native code ended in a period; an agent does not publish 0."""
-# What an agent publishes, as 1, while the free share of its server's disk is below the percentage.
+# Metric that an agent publishes, as 1, while less than `LOW_DISK_PERCENT` of its server's disk are free.
 DISK_LOW = "DiskLow"
+# Free share of a disk below which an operator is notified: 0.8 GB of a server's volume, for days of logs.
 LOW_DISK_PERCENT = 10.0
 
 Source = str
-"""Of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
+"""Origin of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """One metric; ``name`` is its name in an expression, *source* says whose dimensions it has."""
+    """One metric; ``name`` is its name in an expression, and the dimensions are those of *source*."""
 
     name: str
     namespace: str

@@ -28,7 +28,7 @@ HARMLESS: Mapping[tuple[str, str], str] = {
     ("lambda_pnp/keys.py", "B310"): "the address of the bucket, from the stack, always https",
     ("rse_pf/aws/fleet/instance.py", "B105"): "seconds that a metadata token lives",
     ("rse_pf/aws/fleet/instance.py", "B310"): "the instance's own metadata, a literal address",
-    ("rse_pf/aws/money/leftovers.py", "B105"): "a sentence about the secret, not the secret",
+    ("rse_pf/aws/lifecycle/leftovers.py", "B105"): "a sentence about the secret, not the secret",
     (
         "rse_pf/server/sandbox/isolation.py",
         "B108",
@@ -58,8 +58,8 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/hostile/test_floods.py", "Hex High Entropy String"): "digits of a long number",
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
-    ("rse_pf/aws/money/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
-    ("tests/aws/money/test_leftovers.py", "Secret Keyword"): "a name",
+    ("rse_pf/aws/lifecycle/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
+    ("tests/aws/lifecycle/test_leftovers.py", "Secret Keyword"): "a name",
     (
         "tests/server/gateway/test_audit_recorder.py",
         "JSON Web Token",

@@ -55,5 +55,4 @@ LACKING = {
         "tests/aws/lifecycle/test_killed.py",
         "test_parking_that_is_ended_between_note_and_group_is_finished_by_the_same_command",
     ): "autoscaling",
-    ("tests/aws/money/test_spending.py", "test_the_answer_of_cost_explorer_is_understood"): "ce",
 }

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from rse_pf.aws.money.costs import bill_of
-from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.costs.bill import bill_of
+from rse_pf.extensions.costs.prices import load_prices
 
 SMALL = PlatformSettings.from_dict({"cloud": {"profile": "small"}})
 

@@ -1,7 +1,6 @@
-"""Prove that a deployment is gone: what AWS still lists under its tag, and what that costs.
+"""Check that a deployment is gone: list what AWS still has under its tag, and what that costs.
 
-The proof does not rely on the stacks: it asks the tagging service, and looks for what cannot be tagged by
-name.
+The check does not rely on the stacks: it reads the tagging service, and finds by name what cannot be tagged.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.money.leftovers import find_leftovers
-from rse_pf.aws.money.prices import Prices
+from rse_pf.aws.lifecycle.leftovers import find_leftovers
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 
 __all__ = ["KeptResource", "Proof", "prove"]
@@ -21,6 +19,7 @@ _CLASSES = (
     "StandardStorage", "StandardIAStorage", "GlacierInstantRetrievalStorage", "GlacierStorage",
     "IntelligentTieringFAStorage", "IntelligentTieringIAStorage",
 )  # fmt: skip
+# Days that are read back for the size of a bucket: AWS publishes it once a day, up to two days late.
 _SIZE_DAYS = 3
 _DAY_S = 86400
 _KEPT_SERVICES = {"s3": "bucket", "secretsmanager": "secret"}
@@ -29,7 +28,7 @@ _ENDED = ("terminated", "shutting-down")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptResource:
-    """What is kept on purpose; ``gb`` is None as long as AWS has not measured it (once a day)."""
+    """A resource that is kept on purpose; ``gb`` is None until AWS has measured the bucket, once a day."""
 
     kind: str
     name: str
@@ -39,7 +38,7 @@ class KeptResource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proof:
-    """What is kept, and the names of what is left although nobody wants it."""
+    """The resources that are kept on purpose, and the names of those that should not exist any more."""
 
     kept: tuple[KeptResource, ...]
     left: tuple[str, ...]
@@ -50,8 +49,23 @@ class Proof:
         return sum(each.per_month for each in self.kept)
 
 
-def prove(account: Account, names: ResourceNames, prices: Prices, *, now: datetime) -> Proof:
-    """Return what there still is of a deployment at *now*, in UTC; raises as `Account.find`."""
+def prove(
+    account: Account,
+    names: ResourceNames,
+    *,
+    gb_month_price: float,
+    secret_month_price: float,
+    now: datetime,
+) -> Proof:
+    """Return the resources of a deployment that exist at *now*, in UTC; raises as `Account.find`.
+
+    Args:
+        account: Of the deployment.
+        names: Of its resources.
+        gb_month_price: Of a GB in S3 for a month.
+        secret_month_price: Of a secret for a month.
+        now: In UTC.
+    """
     tagged = _list_tagged(account, names)
     kept_names = sorted({(_kind_if_kept(arn), _name(arn)) for arn in tagged if _kind_if_kept(arn)})
     remaining = {arn for arn in tagged if not _kind_if_kept(arn)} - _find_ended_servers(account, tagged)
@@ -63,7 +77,7 @@ def prove(account: Account, names: ResourceNames, prices: Prices, *, now: dateti
     resources = []
     for kind, name in kept_names:
         gb = _gigabytes(account, name, now) if kind == "bucket" else 0.0
-        price = prices.stored_per_gb_month * (gb or 0.0) if kind == "bucket" else prices.secret_per_month
+        price = gb_month_price * (gb or 0.0) if kind == "bucket" else secret_month_price
         resources.append(KeptResource(kind=kind, name=name, gb=gb, per_month=price))
     return Proof(kept=tuple(resources), left=tuple(sorted(remaining)))
 
@@ -73,7 +87,7 @@ def _list_tagged(account: Account, names: ResourceNames) -> set[str]:
         "resourcegroupstaggingapi", "get_resources", "ResourceTagMappingList",
         TagFilters=[{"Key": DEPLOYMENT_TAG, "Values": [names.prefix]}],
     )  # fmt: skip
-    data = names.stack("Data")  # the stack itself costs nothing, and stands as long as the data is kept
+    data = names.stack("Data")  # the stack itself costs nothing, and exists as long as the data is kept
     return {str(row["ResourceARN"]) for row in rows if f":stack/{data}/" not in str(row["ResourceARN"])}
 
 
@@ -104,7 +118,7 @@ def _find_ended_servers(account: Account, tagged: set[str]) -> set[str]:
 
 
 def _gigabytes(account: Account, bucket: str, now: datetime) -> float | None:
-    """Return the size of a bucket as AWS measures it once a day; None if it did not yet."""
+    """Return the size of a bucket as AWS measures it once a day; None before the first measurement."""
     queries = [
         {
             "Id": f"q{at}",

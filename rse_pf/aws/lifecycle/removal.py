@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from typing import Any
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.money.leftovers import Leftover, find_leftovers
+from rse_pf.aws.lifecycle.leftovers import Leftover, find_leftovers
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 

@@ -12,11 +12,11 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
 from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.plan import Step
-from rse_pf.aws.money.costs import HOURS, Bill, bill_of, parked
-from rse_pf.aws.money.prices import Prices, operators_prices
 from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.extensions.costs.bill import HOURS, Bill, bill_of, parked
+from rse_pf.extensions.costs.prices import Prices, operators_prices
 from rse_pf.terminal import show
 
 __all__ = [

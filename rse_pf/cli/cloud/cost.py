@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
-from rse_pf.aws.money.costs import Bill, Load
-from rse_pf.aws.money.prices import Prices
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.extensions.costs.bill import Bill, Load
+from rse_pf.extensions.costs.prices import Prices
 from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
@@ -45,8 +45,8 @@ class CostRequest:
 
 def show_costs(request: CostRequest, settings: PlatformSettings) -> int:
     """Print the bill and what other ways to run the platform would cost, and return 0."""
-    from rse_pf.aws.money.costs import NOT_INCLUDED, bill_of
-    from rse_pf.aws.money.prices import operators_prices
+    from rse_pf.extensions.costs.bill import NOT_INCLUDED, bill_of
+    from rse_pf.extensions.costs.prices import operators_prices
 
     load = _load(request)
     prices = operators_prices(request.prices, Path.cwd())
@@ -110,7 +110,7 @@ def _show_bill(bill: Bill, prices: Prices) -> None:
 
 def _show_alternatives(bill: Bill, settings: PlatformSettings, prices: Prices, load: Load) -> None:
     """Show what other ways to run the platform cost, and whether the settings allow this load."""
-    from rse_pf.aws.money.costs import (
+    from rse_pf.extensions.costs.bill import (
         DAY_H,
         bill_of,
         lambda_alone,

@@ -38,7 +38,7 @@ def check_deployment(request: NoOptions, settings: PlatformSettings) -> int:
 
 def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.money.quotas import check_account
+    from rse_pf.aws.lifecycle.account_checks import check_account
 
     try:
         for check in check_account(open_account(settings.cloud.region), settings):

@@ -47,7 +47,7 @@ def take_down(request: DownRequest, settings: PlatformSettings) -> int:
     changing.show_steps(plan)
     costs = changing.deployment_costs(settings)
     show(f"it cost {costs.line(costs.running)}, and more with robots", *costs.warnings(settings))
-    _show_kept(prove(account, names, costs.prices, now=datetime.now(timezone.utc)), is_over=False)
+    _show_kept(_prove(account, names, costs), is_over=False)
     if not changing.confirmed(request) or (request.delete_data and not _confirmed_twice(request, names)):
         return 1
     tools = changing.make_tools(account, settings, request)
@@ -78,11 +78,18 @@ def _confirmed_twice(request: DownRequest, names: ResourceNames) -> bool:
     return sys.stdin.readline().strip() == names.prefix
 
 
+def _prove(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
+    return prove(
+        account, names, gb_month_price=costs.prices.stored_per_gb_month,
+        secret_month_price=costs.prices.secret_per_month, now=datetime.now(timezone.utc),
+    )  # fmt: skip
+
+
 def _last_proof(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
     """Return the proof, when AWS lists nothing any more that nobody keeps, or after a minute."""
     deadline = time.monotonic() + _LISTED_LATE_S
     while True:
-        proof = prove(account, names, costs.prices, now=datetime.now(timezone.utc))
+        proof = _prove(account, names, costs)
         if not proof.left or time.monotonic() > deadline:
             return proof
         time.sleep(_POLL_S)

@@ -17,7 +17,7 @@ def show_leftovers(request: NoOptions, settings: PlatformSettings) -> int:
     """Print what is left over; return 1 if anything is, 2 if AWS could not be asked."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.cloudformation import list_living_stacks
-    from rse_pf.aws.money.leftovers import find_leftovers
+    from rse_pf.aws.lifecycle.leftovers import find_leftovers
 
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
     try:

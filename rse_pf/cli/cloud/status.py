@@ -5,11 +5,11 @@ from __future__ import annotations
 from datetime import datetime, timezone
 
 from rse_pf.aws.lifecycle.deployment import Deployment
-from rse_pf.aws.money.costs import HOURS
 from rse_pf.cli.cloud import changing
 from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
+from rse_pf.extensions.costs.bill import HOURS
 from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]

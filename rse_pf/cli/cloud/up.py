@@ -69,7 +69,7 @@ def finish(account: Account, settings: PlatformSettings) -> int:
 
 def _findings(account: Account, settings: PlatformSettings) -> Iterator[Finding]:
     """Yield what the doctor finds, but for what `up` has a step for."""
-    from rse_pf.aws.money.quotas import NOT_BOOTSTRAPPED, check_account
+    from rse_pf.aws.lifecycle.account_checks import NOT_BOOTSTRAPPED, check_account
 
     for finding in check_tools(Path.cwd()):
         if not finding.what.startswith(NO_PACKAGES):

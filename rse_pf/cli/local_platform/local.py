@@ -291,7 +291,7 @@ def show_status(request: _StatusRequest, settings: PlatformSettings) -> None:
 
 def kill_balancer(request: PlatformRequest, settings: PlatformSettings) -> None:
     """Kill the load balancer; the control plane starts another one."""
-    from rse_pf.local.faults import faults
+    from rse_pf.extensions.experiments.faults import faults
 
     show(f"killed the load balancer (pid {faults.kill_balancer(request.read_state())})")
 
@@ -308,7 +308,7 @@ def resume(request: _ServerRequest, settings: PlatformSettings) -> None:
 
 def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
     """Stop all processes of a server, and continue them after a time if one is named."""
-    from rse_pf.local.faults import faults
+    from rse_pf.extensions.experiments.faults import faults
 
     state = request.read_state()
     server = faults.find_server(state, request.server)
@@ -325,7 +325,7 @@ def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
     """Leave a server a part of its CPU time, until a time is over or Ctrl-C."""
-    from rse_pf.local.faults import faults
+    from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
     wait = request.waiter()
@@ -336,7 +336,7 @@ def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
 
 def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
     """Cut a server off from the network, until a time is over or Ctrl-C."""
-    from rse_pf.local.faults import faults
+    from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
     wait = request.waiter()
@@ -347,7 +347,7 @@ def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 
 def _signal(request: _ServerRequest, number: signal.Signals, done: str) -> None:
-    from rse_pf.local.faults import faults
+    from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
     count = faults.signal_tree(server.process, number)

@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.fleet.overview import read_overview
+from rse_pf.extensions.fleet_page.feeds.cloud_overview import read_overview
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.extensions.fleet_page.app import PageActions

@@ -9,9 +9,9 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle import removal
+from rse_pf.aws.lifecycle.leftovers import Leftover
 from rse_pf.aws.lifecycle.plan import Step
 from rse_pf.aws.lifecycle.removal import erase_data
-from rse_pf.aws.money.leftovers import Leftover
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 from tests.kit.account_on_moto import NAMES, Killer, account_of

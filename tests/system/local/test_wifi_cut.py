@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 import pytest
 
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.experiments.faults.network_emulator import PROFILES, LinkProcess
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.load.swarm import Swarm
 from rse_pf.local.control.platform import LocalPlatform
-from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 

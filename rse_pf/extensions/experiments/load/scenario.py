@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.errors import UsageError
-from rse_pf.local.faults.network_emulator import profile_named
+from rse_pf.extensions.experiments.faults.network_emulator import profile_named
 from rse_pf.wire import CODECS
 
 __all__ = ["LoadScenario", "read_scenario", "write_scenario"]
@@ -32,7 +32,8 @@ class LoadScenario:
 
     Robot k connects ``k * join_every_s`` after the start; ``seconds`` count from when all have joined.
     ``keep`` asks the platform to answer every frame, not only the newest.  ``link`` names a profile of
-    `rse_pf.local.faults.network_emulator`, and ``processes`` those of the generator in Python.
+    `rse_pf.extensions.experiments.faults.network_emulator`, and ``processes`` counts those of the generator
+    in Python.
     """
 
     robots: int = 10

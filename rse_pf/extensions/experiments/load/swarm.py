@@ -30,6 +30,7 @@ from rse_pf.extensions.experiments.child_process import (
     end_process,
     start_process,
 )
+from rse_pf.extensions.experiments.faults.network_emulator import LinkProcess, profile_named
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.load.swarm_process import (
     FinishSwarm,
@@ -42,7 +43,6 @@ from rse_pf.extensions.experiments.load.swarm_process import (
     run_swarm_process,
 )
 from rse_pf.extensions.experiments.results.records import CommandRecord
-from rse_pf.local.faults.network_emulator import LinkProcess, profile_named
 from rse_pf.wire.rate_limit import REASONS
 
 __all__ = ["Swarm", "SwarmResult", "records_of"]

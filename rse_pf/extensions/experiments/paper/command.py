@@ -148,8 +148,8 @@ def _elasticity(request: ExperimentRequest, settings: PlatformSettings) -> int:
 
 
 def _latency(request: ExperimentRequest, settings: PlatformSettings) -> int:
+    from rse_pf.extensions.experiments.faults.network_emulator import profile_named
     from rse_pf.extensions.experiments.paper.latency import LatencyOptions, run_latency
-    from rse_pf.local.faults.network_emulator import profile_named
 
     link = None if request.link == "none" else profile_named(request.link).name
     return run_latency(_options(LatencyOptions, request, link=link), settings)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.experiments.faults.network_emulator import profile_named
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.paper.harness import Harness, generator_of
 from rse_pf.extensions.experiments.plots.figures import draw_latency, require_matplotlib
@@ -35,7 +36,6 @@ from rse_pf.extensions.experiments.results.summary import (
     percent_answered,
     summary_of,
 )
-from rse_pf.local.faults.network_emulator import profile_named
 from rse_pf.terminal import show, show_page
 
 __all__ = ["LatencyOptions", "latency_figures", "latency_page", "run_latency"]

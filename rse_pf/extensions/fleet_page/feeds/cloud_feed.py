@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
-from rse_pf.aws.fleet.group_metrics import GroupMetrics, read_group_metrics
-from rse_pf.aws.fleet.overview import CloudOverview, ScalingActivity, read_overview
+from rse_pf.extensions.fleet_page.feeds.cloud_metrics import GroupMetrics, read_group_metrics
+from rse_pf.extensions.fleet_page.feeds.cloud_overview import CloudOverview, ScalingActivity, read_overview
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
+
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.money.quotas import NOT_BOOTSTRAPPED, Check, check_account
+from rse_pf.aws.lifecycle.account_checks import NOT_BOOTSTRAPPED, Check, check_account
 from rse_pf.config import PlatformSettings
 
 SETTINGS = PlatformSettings()
@@ -99,11 +101,15 @@ def test_a_bootstrap_never_changes_the_stack_of_another_qualifier(region: str) -
     assert own.what.startswith(NOT_BOOTSTRAPPED)
 
 
-def test_too_few_vcpus_for_the_largest_fleet_fail(region: str) -> None:
-    check = only("vCPUs", checks(region, quotas=Quotas(L_1216C47A=21)))
+@pytest.mark.parametrize(
+    ("kind", "needed"), [("c7i.large", 22), ("t3.medium", 22), ("z1d.xlarge", 44), ("z1d.4xlarge", 176)]
+)
+def test_too_few_vcpus_for_the_largest_fleet_fail(region: str, kind: str, needed: int) -> None:
+    settings = SETTINGS.replace(cloud={"instance_type": kind})
+    check = only("vCPUs", checks(region, settings, Quotas(L_1216C47A=21)))
 
     assert check.grade == "fail"
-    assert check.what.startswith("quota 21, needed 22")
+    assert check.what.startswith(f"quota 21, needed {needed}")
 
 
 def test_an_instance_type_that_the_region_lacks_fails(region: str) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
-from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import (
     CANARY_MB,
@@ -24,6 +23,7 @@ from rse_pf.config.cloud_layout import (
     zone_count,
 )
 from rse_pf.config.front_door import rate_rules
+from rse_pf.extensions.costs.prices import Prices
 from rse_pf.scaling.alarms import alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
 from rse_pf.scaling.profile import cadence_of

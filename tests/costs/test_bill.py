@@ -5,14 +5,14 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rse_pf.aws.money.costs import (
+from rse_pf.config import PlatformSettings
+from rse_pf.extensions.costs.bill import (
     Load,
     bill_of,
     parked,
     servers_needed,
 )
-from rse_pf.aws.money.prices import ServerPrice, load_prices
-from rse_pf.config import PlatformSettings
+from rse_pf.extensions.costs.prices import ServerPrice, load_prices
 
 SETTINGS = PlatformSettings().replace(
     scaling={"min_servers": 2, "max_servers": 4, "busy_cpu_percent": 70.0}, cloud={"canary": False}

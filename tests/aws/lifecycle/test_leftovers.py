@@ -8,7 +8,7 @@ import pytest
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.cloudformation import list_living_stacks
-from rse_pf.aws.money.leftovers import find_leftovers
+from rse_pf.aws.lifecycle.leftovers import find_leftovers
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.aws.money.prices import load_prices, operators_prices
 from rse_pf.errors import ConfigurationError
+from rse_pf.extensions.costs.prices import load_prices, operators_prices
 
 
 @pytest.mark.parametrize(

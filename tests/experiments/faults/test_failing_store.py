@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rse_pf.local.faults.failing_store import failing_environment, set_failing_percent
+from rse_pf.extensions.experiments.faults.failing_store import failing_environment, set_failing_percent
 from rse_pf.storage.object_store import DirectoryStore
 
 PROGRAM = """

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.local.faults.network_emulator import (
+from rse_pf.extensions.experiments.faults.network_emulator import (
     PROFILES,
     EmulatedLink,
     Lane,

@@ -1,13 +1,12 @@
 """The prices that an estimate is made from: one dated table for one region, without taxes.
 
-`rse_pf/aws/money/prices.json` holds the table of the release.  A file ``prices.json`` in the folder of
+`rse_pf/extensions/costs/prices.json` holds the table of the release.  A file ``prices.json`` in the folder of
 cdk.json, or ``rse-pf cloud cost --prices FILE``, replaces all prices or some; it should also name its own
 ``as_of``, ``region`` and ``source``.
 """
 
 from __future__ import annotations
 
-import re
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,12 +97,6 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 hint=f"add it to servers in {PRICES_FILE} beside cdk.json: vcpus, per_hour, spot_per_hour",
             )
         return price
-
-    def vcpus(self, instance_type: str) -> int:
-        """Return the vCPUs of an EC2 type, by its size where the table lacks it: 2 without ``xlarge``."""
-        price = self.servers.get(instance_type)
-        size = re.search(r"\.(\d*)xlarge$", instance_type)
-        return price.vcpus if price else 4 * int(size[1] or 1) if size else 2
 
     def warnings(self, *, today: date, region: str) -> list[str]:
         """Return what is wrong with these prices for an estimate of today in *region*."""

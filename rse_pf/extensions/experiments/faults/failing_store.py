@@ -28,7 +28,7 @@ _VARIABLE = "RSE_PF_FAILING_STORE"
 _SHARE = "percent"
 _READS = ("get", "head")
 _WRITES = ("put", "put_pieces", "compare_and_swap", "delete")
-_SITE = "from rse_pf.local.faults.failing_store import install\n\ninstall()\n"
+_SITE = "from rse_pf.extensions.experiments.faults.failing_store import install\n\ninstall()\n"
 
 
 @contextlib.contextmanager

@@ -6,12 +6,12 @@ is changed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.cloudformation import find_foreign_qualifier, list_living_stacks, read_bootstrap_version
-from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.elasticity import instance_types
@@ -21,11 +21,16 @@ from rse_pf.errors import ConfigurationError, StoreError
 __all__ = ["NOT_BOOTSTRAPPED", "Check", "check_account"]
 
 NOT_BOOTSTRAPPED = "the CDK is not bootstrapped"
-"""What a check says for which `rse-pf cloud up` has a step."""
+"""Beginning of the failure that ``rse-pf cloud up`` repairs by itself."""
 
-_VCPUS, _EXECUTIONS, _VPCS = ("ec2", "L-1216C47A"), ("lambda", "L-B99A9384"), ("vpc", "L-F678F1CE")
+# Service and code of a quota: vCPUs of on-demand instances, concurrent executions of Lambda, and VPCs.
+_VCPUS_QUOTA = ("ec2", "L-1216C47A")
+_EXECUTIONS_QUOTA = ("lambda", "L-B99A9384")
+_VPCS_QUOTA = ("vpc", "L-F678F1CE")
+# Executions of an account that AWS keeps for functions without a reservation.
 _ALWAYS_UNRESERVED = 100
-"""AWS keeps this many executions of an account for functions without a reservation."""
+# vCPUs of the types from ``medium`` to ``large``; ``Nxlarge`` has 4 N.
+_VCPUS_BELOW_XLARGE = 2
 _ASK_FOR_MORE = "ask for more in the Service Quotas console"
 
 
@@ -42,7 +47,7 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
 
     Raises:
         ConfigurationError: AWS does not accept the credentials.
-        StoreError: AWS does not even say whose they are.
+        StoreError: AWS does not answer.
     """
     caller = account.find("sts", "get_caller_identity") or {}
     yield Check("ok", f"signed in as {caller.get('Arn', '?')}, region {account.region}")
@@ -130,23 +135,28 @@ def _check_instance_type(account: Account, settings: PlatformSettings) -> Check:
 
 def _check_vcpus(account: Account, settings: PlatformSettings) -> Check:
     # An instance that drains still runs when its replacement starts.
-    needed = (settings.scaling.max_servers + 1) * load_prices().vcpus(settings.cloud.instance_type)
+    needed = (settings.scaling.max_servers + 1) * _vcpus_of(settings.cloud.instance_type)
     return _check_quota(
-        account, _VCPUS, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
+        account, _VCPUS_QUOTA, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
     )
+
+
+def _vcpus_of(instance_type: str) -> int:
+    size = re.search(r"\.(\d*)xlarge$", instance_type)
+    return 4 * int(size[1] or 1) if size else _VCPUS_BELOW_XLARGE
 
 
 def _check_executions(account: Account, settings: PlatformSettings) -> Check:
     needed = settings.cloud.lambda_concurrency + _ALWAYS_UNRESERVED
     need = f"concurrent executions: cloud.lambda_concurrency, and {_ALWAYS_UNRESERVED} that stay unreserved"
-    return _check_quota(account, _EXECUTIONS, needed, need)
+    return _check_quota(account, _EXECUTIONS_QUOTA, needed, need)
 
 
 def _check_vpcs(account: Account, settings: PlatformSettings) -> Check:
     names = ResourceNames(settings.cloud.name)
     ours = names.stack("Network") in list_living_stacks(account, names)
     there = len(account.pages("ec2", "describe_vpcs", "Vpcs"))
-    return _check_quota(account, _VPCS, there + (0 if ours else 1), "VPCs in the region, with this one")
+    return _check_quota(account, _VPCS_QUOTA, there + (0 if ours else 1), "VPCs in the region, with this one")
 
 
 def _check_quota(account: Account, quota: tuple[str, str], needed: int, need: str) -> Check:
@@ -156,7 +166,9 @@ def _check_quota(account: Account, quota: tuple[str, str], needed: int, need: st
     if answer is None:  # the account has the default of AWS
         answer = account.find("service-quotas", "get_aws_default_service_quota", **query)
     if answer is None:
-        return Check("warn", f"quota {service} {code} is not told; needed are {needed} {need}", _ASK_FOR_MORE)
+        return Check(
+            "warn", f"quota {service} {code} cannot be read; needed are {needed} {need}", _ASK_FOR_MORE
+        )
     most = float(answer["Quota"]["Value"])
     line = f"quota {most:g}, needed {needed}: {need}"
     return Check("ok", line) if most >= needed else Check("fail", line, _ASK_FOR_MORE)
