@@ -61,7 +61,7 @@ def check_context(given: dict[str, Any], written: dict[str, Any]) -> None:
 
 
 def settings_file(given: dict[str, Any], root: Path) -> Path:
-    """Return the file that the context `SETTINGS_CONTEXT` names, or cdk.json beside this program."""
+    """Return the file that the context `SETTINGS_CONTEXT` names, or cdk.json next to this program."""
     named = given.get(SETTINGS_CONTEXT)
     return Path(named) if named else root / "cdk.json"
 
@@ -70,7 +70,7 @@ def main() -> int:
     """Synthesise; print an error and its hint in two lines, and return 2, if that is not possible."""
     root = Path(__file__).parent
     try:
-        load_settings(root / "cdk.json")  # it also tells in a line what is wrong with the file
+        load_settings(root / "cdk.json")  # for its one-line errors
         written = json.loads((root / "cdk.json").read_text(encoding="utf-8")).get("context", {})
         app = cdk.App(context=written)
         given = dict(app.node.get_all_context())

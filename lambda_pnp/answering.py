@@ -44,11 +44,12 @@ _ROOT = Path(__file__).resolve().parents[1]
 _SERVER = "lambda"
 # How long a revoked token may still be accepted while S3 answers: no connection could be closed earlier.
 _MAX_STALE_S = 30.0
+# Headers of one request: robots send about ten.
 _MAX_HEADERS = 200
-_RIGHT = "services:pnp"
-"""Without it a token gets nothing here, and nothing of its body is decoded."""
-_READ = ("authorization", "content-type")
-"""Headers that mean something here."""
+# Scope that every token needs here; without it the body is not decoded.
+_REQUIRED_SCOPE = "services:pnp"
+# Headers that the function reads.
+_READ_HEADERS = ("authorization", "content-type")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,8 +119,8 @@ class Answering:
         except RsePfError as error:
             return _error_answer(error)
         try:
-            if not scopes_allow(claims.scopes, _RIGHT):
-                raise _forbidden_error(_RIGHT)
+            if not scopes_allow(claims.scopes, _REQUIRED_SCOPE):
+                raise _forbidden_error(_REQUIRED_SCOPE)
             data = self._decode(body)
         except RsePfError as error:
             return self._encode(codec, failure_of(error, server=_SERVER))
@@ -160,7 +161,7 @@ class Answering:
         return self._codecs[name]
 
     def _decode(self, body: str | bytes) -> bytes:
-        """Return the message of a body; a ``str`` is base64 that is judged by its length first."""
+        """Return the message of a body; a ``str`` is base64, whose length is checked first."""
         if isinstance(body, bytes):
             return body
         max_bytes = self._settings.session.max_message_bytes
@@ -217,7 +218,7 @@ def _read(event: object) -> tuple[dict[str, str], str | bytes]:
 
 
 def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the headers, names in small letters; one that came twice is not guessed at."""
+    """Return the headers, names in small letters; a repeated header that is read is an error."""
     lists = event.get("multiValueHeaders")
     headers = lists or event.get("headers") or {}
     if not isinstance(headers, Mapping) or len(headers) > _MAX_HEADERS:
@@ -229,7 +230,7 @@ def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
         if not isinstance(name, str) or not (isinstance(value, str) or (lists and isinstance(value, list))):
             raise _bad_event("a header is not a text")
         if name.lower() in lowered or not isinstance(value, str):
-            if name.lower() in _READ:
+            if name.lower() in _READ_HEADERS:
                 raise _bad_event(f"there is more than one {name.lower()}")
             continue
         lowered[name.lower()] = value

@@ -22,7 +22,9 @@ from rse_pf.errors import NotFound, RsePfError, message_of
 
 __all__ = ["KeyCache", "read_object", "signed_request"]
 
+# Time limit of one fetch, in seconds: three of them fit into the time limit of an execution.
 _TIMEOUT_S = 3.0
+# Pause after a failed fetch, in seconds, so that executions do not spend their time on it.
 _RETRY_PAUSE_S = 5.0
 _NOT_FOUND = 404
 _T = TypeVar("_T", Roster, DenyList)
@@ -79,7 +81,7 @@ class KeyCache:
 
 
 def read_object(environment: Mapping[str, str], now: datetime, control: str = "") -> str:
-    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names, or *control* in the folder beside it.
+    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names, or *control* in its folder ``control``.
 
     Raises:
         NotFound: There is no such object.
@@ -104,7 +106,7 @@ def signed_request(
     Args:
         environment: Of the function.
         now: UTC.
-        control: Name in the folder ``control`` beside the keys; empty for the keys themselves.
+        control: Name in the folder ``control`` next to the keys; empty for the keys themselves.
     """
     bucket, _, keys = environment["RSE_PF_KEYS"].partition("/")
     name = f"{keys.rpartition('/')[0]}/control/{control}".lstrip("/") if control else keys

@@ -1,4 +1,4 @@
-"""Play, on one machine, what stands before the function on AWS: firewall, load balancer and Lambda.
+"""Emulate on one machine the firewall, the load balancer and the Lambda around the function.
 
     python -m lambda_pnp.local_front FOLDER [--port P] [--parent PID]
 
@@ -32,7 +32,7 @@ from rse_pf.http.unauthenticated import BACKLOG, MAX_SILENT
 from rse_pf.processes.linux import die_with_parent, set_process_name
 from rse_pf.terminal import show, show_error, show_json
 
-__all__ = ["LocalFront", "answering_of", "read_beside"]
+__all__ = ["LocalFront", "answering_of", "read_platform_file"]
 
 _HOST = "127.0.0.1"
 _TIMEOUT_S = 10.0  # limit of a body, and of an execution, as stacks/serverless_stack.py sets it
@@ -46,8 +46,9 @@ class LocalFront:
     """The firewall, the load balancer and the executions of one function, as an ASGI application.
 
     Attributes:
-        answered: Requests that an execution answered; ``refused`` those that met none.
-        executions: How many were started.
+        answered: Number of requests that an execution answered.
+        refused: Number of requests for which no execution was free.
+        executions: Number of executions that were started.
     """
 
     def __init__(self, make: Callable[[], Answering], *, most: int) -> None:
@@ -55,7 +56,7 @@ class LocalFront:
 
         Args:
             make: Starts an execution.
-            most: How many there may be at a time.
+            most: Largest number of executions at a time.
         """
         self.answered = self.refused = self.executions = 0
         self._make = make
@@ -147,15 +148,15 @@ def answering_of(settings: PlatformSettings, folder: Path) -> Callable[[], Answe
 
     def make() -> Answering:
         keys = KeyCache(
-            lambda: read_beside(folder), settings.scaling.period_s,
-            read_control=lambda name: read_beside(folder, f"control/{name}"),
+            lambda: read_platform_file(folder), settings.scaling.period_s,
+            read_control=lambda name: read_platform_file(folder, f"control/{name}"),
         )  # fmt: skip
         return Answering(settings, keys)
 
     return make
 
 
-def read_beside(folder: Path, name: str = "keys.json") -> str:
+def read_platform_file(folder: Path, name: str = "keys.json") -> str:
     """Return a file of a platform; raises NotFound if there is none."""
     try:
         return (folder / name).read_text(encoding="utf-8")

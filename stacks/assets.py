@@ -1,4 +1,4 @@
-"""Find the packages that `make assets` built, and lay settings and boot files beside them.
+"""Copy the packages that `make assets` built, and add settings and boot files.
 
 Nothing is built here: synthesis only copies and hashes what it finds.
 """
@@ -19,13 +19,13 @@ __all__ = ["ENVIRONMENT_FILE", "SERVERS", "SETTINGS_FILE", "SUMS_FILE", "staged"
 SETTINGS_FILE = "settings.json"
 SUMS_FILE = "SHA256SUMS"
 SERVERS = "servers"
-"""The folder of what a backend server unpacks."""
+"""The folder of the archives that a backend server unpacks."""
 ENVIRONMENT_FILE = "environment.json"
 """In that folder: the Python that the archives are for, and the digests of our sources in them."""
 _BOOT = Path(__file__).parent / "boot"
 _IN_USER_DATA = "first_boot.py"
 _ROOT = Path(__file__).resolve().parents[1]
-_OURS = "rse_pf"
+_PACKAGE = "rse_pf"
 
 
 def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> Path:
@@ -63,14 +63,14 @@ def sums_digest(package: Path) -> str:
 
 
 def _check_fresh(packages: Path) -> None:
-    """Refuse packages that were built of other sources: they might not even know the settings beside them."""
+    """Refuse packages that were built of other sources: they might not read the added settings."""
     built = {
-        file.relative_to(packages).as_posix(): _digest(file) for file in (packages / _OURS).rglob("*.py")
+        file.relative_to(packages).as_posix(): _digest(file) for file in (packages / _PACKAGE).rglob("*.py")
     }
     built.update(_read_digests(packages / ENVIRONMENT_FILE))
     if not built:
         return
-    sources = {file.relative_to(_ROOT).as_posix(): file for file in (_ROOT / _OURS).rglob("*.py")}
+    sources = {file.relative_to(_ROOT).as_posix(): file for file in (_ROOT / _PACKAGE).rglob("*.py")}
     if built.keys() != sources.keys() or any(_digest(sources[name]) != built[name] for name in built):
         raise ConfigurationError(
             f"the packages in {packages} were built of other sources", hint="run make assets"

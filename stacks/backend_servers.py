@@ -2,7 +2,7 @@
 
 They boot from one package in S3, whose digest is in the template.  There is no SSH and no public address;
 IMDSv2 is limited to one hop.  An instance that the load balancer finds unhealthy is replaced, and one that
-does not tell that it is ready never joins.
+does not report that it is ready never joins.
 
 A deployment makes a new version of the launch template and moves no server: the group keeps the version that
 the stack's parameter `VERSION_PARAMETER` names.  Only rse-pf cloud upgrade changes it, after it has replaced
@@ -26,7 +26,7 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import zone_count
+from rse_pf.config.cloud_layout import VOLUME_GB, zone_count
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S, retry_within_s
@@ -38,11 +38,10 @@ __all__ = ["BackendServers", "launch_template"]
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
 _STORE = "rse_pf/aws/storage/s3_store.py:S3Store"
-_GIB = 8
 
 
 class BackendServers(Construct):
-    """Role, launch template and group; ``facts`` is what an instance is told at its boot."""
+    """Role, launch template and group; ``facts`` are passed to an instance at its boot."""
 
     def __init__(
         self,
@@ -133,18 +132,18 @@ class BackendServers(Construct):
             used_by="stacks/boot/first_boot.py:asked",
             why="servers of the version before boot from the package before; a digest says what may run",
         )  # fmt: skip
-        # Without it S3 answers "forbidden" for a key set that is not there yet, instead of "not found".
+        # Without it S3 answers "forbidden" instead of "not found" for a key set that does not exist yet.
         allow(role, ["s3:ListBucket"], [artifacts.bucket_arn], used_by=f"{_STORE}._get")
         allow(
             role, ["cloudwatch:PutMetricData"], ["*"],
             conditions={"StringEquals": {"cloudwatch:namespace": NAMESPACE}},
             used_by="rse_pf/aws/fleet/tasks/server_metrics.py:_Publisher.publish",
-            why="PutMetricData knows no resources; the condition allows one namespace",
+            why="PutMetricData takes no resources; the condition allows one namespace",
         )  # fmt: skip
         allow(
             role, ["cloudwatch:GetMetricData"], ["*"],
             used_by="rse_pf/aws/fleet/tasks/rebalancing.py:read_totals",
-            why="GetMetricData knows neither resources nor conditions; it reads numbers only",
+            why="GetMetricData takes neither resources nor conditions; it reads numbers only",
         )  # fmt: skip
         allow(
             role, ["s3:PutObject"], [artifacts.arn_for_objects(f"{JOURNAL_PREFIX}/*")],
@@ -153,12 +152,12 @@ class BackendServers(Construct):
         return role
 
     def _allow_objects(self, maps: s3.IBucket) -> None:
-        """Allow the servers and the data service beside them to read and write robots' objects and maps."""
+        """Allow servers and data services to read and write robots' objects and maps."""
         allow(
             self.role, ["s3:GetObject", "s3:PutObject", "s3:DeleteObject", "s3:AbortMultipartUpload"],
             [maps.arn_for_objects("*")],
             used_by=(f"{_STORE}._get", f"{_STORE}._write", f"{_STORE}.delete", f"{_STORE}.put_pieces"),
-            why="names of objects are digests, which nobody knows beforehand",
+            why="names of objects are digests, which are not known beforehand",
         )  # fmt: skip
         allow(self.role, ["s3:ListBucket"], [maps.bucket_arn], used_by=f"{_STORE}._pages")
 
@@ -179,7 +178,7 @@ def launch_template(
     settings: PlatformSettings,
     facts: Mapping[str, str],
 ) -> ec2.LaunchTemplate:
-    """Return the launch template of a server; *facts* are what `stacks/boot/first_boot.py` is told.
+    """Return the launch template of a server; *facts* are passed to `stacks/boot/first_boot.py`.
 
     Args:
         scope: Has one template.
@@ -189,7 +188,7 @@ def launch_template(
         facts: Plain words by name.
     """
     encrypted = ec2.BlockDeviceVolume.ebs(
-        _GIB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
+        VOLUME_GB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
     )
     script = _BOOT.read_text(encoding="utf-8")
     commands = f"{script}\nmain({cdk.Stack.of(scope).to_json_string(dict(facts))!s})\n"

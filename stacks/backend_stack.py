@@ -58,7 +58,7 @@ class BackendStack(cdk.Stack):
         vpc = import_network(self, names, zones=ZONES, server_zones=zone_count(settings), cidr=CIDR)
         artifacts = import_bucket(self, names, "artifacts")
         self.topic = sns.Topic(self, "Events", enforce_ssl=True)
-        # A topic with a policy of its own forgets the one that lets the account's alarms in.
+        # A policy of its own replaces the topic's default policy, which admits the account's alarms.
         self.topic.add_to_resource_policy(
             iam.PolicyStatement(
                 principals=[
@@ -104,7 +104,7 @@ class BackendStack(cdk.Stack):
                 )
             ],
             used_by=("rse_pf/aws/fleet/launch_hook.py:complete_hook", "stacks/boot/first_boot.py:abandon"),
-            why="the ARN of an Auto Scaling group holds an id that only AWS knows",
+            why="the ARN of an Auto Scaling group holds an id that AWS assigns",
         )  # fmt: skip
         ScaleModifier(
             self, "ScaleModifier", group_name=group.auto_scaling_group_name, topic_arn=self.topic.topic_arn,
@@ -117,7 +117,7 @@ class BackendStack(cdk.Stack):
         self._outputs(settings)
 
     def _outputs(self, settings: PlatformSettings) -> None:
-        cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to be told of alarms")
+        cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to receive alarms")
         name, domain = self.balancer.alb.load_balancer_dns_name, settings.cloud.domain_name
         path, insecure = ROBOTS_PATH, settings.cloud.allow_insecure
         url = f"ws://{name}{path}" if insecure else f"wss://{domain}{path}"

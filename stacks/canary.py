@@ -1,7 +1,7 @@
 """The canary: a function that asks for one known pose through the load balancer each minute.
 
-It is a robot like any other: it knows the public address, and a private key of its own that the operator
-enrols by `rse-pf cloud canary`.  It stands outside of the VPC, and may read one secret and nothing else.
+It connects as any robot does: to the public address, with a private key of its own that the operator enrols
+by `rse-pf cloud canary`.  It runs outside the VPC, and may read one secret and nothing else.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
 
 __all__ = ["Canary"]
 
+# Time limit of an execution, in seconds: the handler gives up earlier, and logs its own error.
 _TIMEOUT_S = 30
-"""Longer than rse_pf/aws/canary/handler.py waits for an answer, so that its own error is told."""
 
 
 class Canary(Construct):
@@ -67,7 +67,7 @@ class Canary(Construct):
                 },
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
-        # A failure is told by the alarm; a retry would only hide it.
+        # The alarm reports a failure; a retry would hide it.
         function.configure_async_invoke(retry_attempts=0, max_event_age=cdk.Duration.seconds(CANARY_PERIOD_S))
         events.Rule(
             self, "EachMinute", schedule=events.Schedule.rate(cdk.Duration.seconds(CANARY_PERIOD_S)),

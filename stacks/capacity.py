@@ -1,4 +1,4 @@
-"""Where the servers' capacity comes from: a warm pool, Spot, several instance types, zones and a schedule.
+"""The sources of the servers' capacity: a warm pool, Spot, several instance types, zones and a schedule.
 
 Everything here changes the Auto Scaling group that `stacks.backend_servers` made, and nothing else.
 """
@@ -19,6 +19,7 @@ from stacks.findings import acknowledge
 
 __all__ = ["Capacity"]
 
+# Percentage of on-demand servers where Spot instances are not used.
 _ALL_ON_DEMAND = 100
 
 
@@ -35,7 +36,7 @@ class Capacity(Construct):
     ) -> None:
         super().__init__(scope, construct_id)
         raw = cast("autoscaling.CfnAutoScalingGroup", group.node.default_child)
-        # Zones are equally full as long as all of them have capacity; one that fails is left.
+        # Zones hold equal numbers while all have capacity; a zone without capacity is left out.
         raw.availability_zone_distribution = (
             autoscaling.CfnAutoScalingGroup.AvailabilityZoneDistributionProperty(
                 capacity_distribution_strategy="balanced-best-effort"
@@ -90,5 +91,5 @@ def _cron(entry: ScheduleEntry) -> str:
 
 
 def _zone(settings: PlatformSettings) -> str:
-    # The name of Universal Time that Auto Scaling knows.
+    # Auto Scaling takes Universal Time under this name only.
     return "Etc/UTC" if settings.scaling.time_zone == "UTC" else settings.scaling.time_zone

@@ -28,10 +28,10 @@ BALANCER_LOGS = "alb"
 _DAY = cdk.Duration.days(1)
 _LEASES = ("live/", "jobs/", "accounts/")
 """Prefixes of leases and accounts, which change up to twice a second: each change leaves a former version."""
+# Days after which an object moves to infrequent access: the least that S3 allows.
 _INFREQUENT_AFTER_DAYS = 30
-"""The soonest that S3 takes an object there."""
+# Days after which an object moves to Glacier (paper, Sect. 5.1); its class needs no restore before a read.
 _GLACIER_AFTER_DAYS = 90
-"""The paper, Sect. 5.1.  What was not written for so long moves to a class that is read like any object."""
 
 
 class DataStack(cdk.Stack):
@@ -101,7 +101,7 @@ class DataStack(cdk.Stack):
             provide(self, names, f"data/{name}", bucket.bucket_name)
 
     def _admit_balancer(self) -> None:
-        """Allow load balancers of this account to write access logs: its stack cannot change our policies."""
+        """Allow load balancers of this account to write access logs; other stacks cannot grant this."""
         writer = region_info.RegionInfo.get(self.region).elbv2_account
         service = iam.ServicePrincipal("logdelivery.elasticloadbalancing.amazonaws.com")
         self.access_logs.add_to_resource_policy(

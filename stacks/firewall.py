@@ -17,7 +17,9 @@ from stacks.findings import acknowledge
 
 __all__ = ["S3_PREFIX_LISTS", "Firewall", "front_port", "inner_ports", "live_range", "s3_prefix_list"]
 
-_HTTP, _HTTPS = 80, 443
+# Ports of the listener without and with TLS.
+_HTTP = 80
+_HTTPS = 443
 
 S3_PREFIX_LISTS = {
     "us-east-1": "pl-63a5400a", "us-east-2": "pl-7ba54012", "us-west-1": "pl-6ba54002",
@@ -25,7 +27,7 @@ S3_PREFIX_LISTS = {
     "ap-northeast-1": "pl-61a54008", "ap-northeast-2": "pl-78a54011", "ap-southeast-1": "pl-6fa54006",
     "ap-southeast-2": "pl-6ca54005",
 }  # fmt: skip
-"""AWS-managed prefix lists com.amazonaws.REGION.s3, each seen in at least two published route tables."""
+"""Managed prefix lists com.amazonaws.REGION.s3 of AWS, each from at least two published route tables."""
 _LOOK_UP = "aws ec2 describe-managed-prefix-lists --filters Name=prefix-list-name,Values=com.amazonaws.{}.s3"
 
 

@@ -31,10 +31,15 @@ from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
 
 __all__ = ["IdleTimer"]
 
+# Time limit of an execution, in seconds: it makes about a dozen calls of AWS.
 _TIMEOUT_S = 60
-_MB = 256
+# Memory of the function, which only makes calls of AWS.
+_MEMORY_MB = 256
 _LIFECYCLE = "rse_pf/aws/lifecycle"
-_RETRIES, _RETRY_WITHIN_S = 5, 3600
+# Repetitions of a call that resumes the deployment, after a failure.
+_RETRIES = 5
+# Time limit of these repetitions, in seconds: an hour late is better than a working day without servers.
+_RETRY_WITHIN_S = 3600
 
 
 class IdleTimer(Construct):
@@ -57,7 +62,7 @@ class IdleTimer(Construct):
                 self, "Function", runtime=lambda_.Runtime.PYTHON_3_13,
                 architecture=lambda_.Architecture.X86_64, code=code,
                 handler=f"{_LIFECYCLE.replace('/', '.')}.idle.handler", role=role,
-                log_group=log, memory_size=_MB, timeout=cdk.Duration.seconds(_TIMEOUT_S),
+                log_group=log, memory_size=_MEMORY_MB, timeout=cdk.Duration.seconds(_TIMEOUT_S),
                 environment={"RSE_PF_TOPIC": topic},
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
@@ -102,7 +107,7 @@ class IdleTimer(Construct):
     def _allow(self, role: iam.Role, names: ResourceNames, topic: str) -> None:
         """Allow to read, to end and to start servers; nothing but the note can be deleted."""
         stack = cdk.Stack.of(self)
-        why = "reading knows no resources"
+        why = "these actions take no resources"
         allow(
             role, ["cloudwatch:GetMetricData"], ["*"], used_by=f"{_LIFECYCLE}/idle.py:_read_hours", why=why
         )  # fmt: skip
@@ -124,7 +129,7 @@ class IdleTimer(Construct):
             [groups],
             used_by=(f"{_LIFECYCLE}/parking.py:empty_group", f"{_LIFECYCLE}/parking.py:fill_groups"),
             conditions={"StringEquals": {f"aws:ResourceTag/{DEPLOYMENT_TAG}": names.prefix}},
-            why="the ARN of a group holds an id that only AWS knows; the tag is of this deployment",
+            why="the ARN of a group holds an id that AWS assigns; the tag is of this deployment",
         )  # fmt: skip
         allow(
             role, ["cloudwatch:DescribeAlarms"], ["*"],

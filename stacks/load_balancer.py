@@ -18,8 +18,8 @@ from stacks.web_firewall import WebFirewall
 
 __all__ = ["LoadBalancer"]
 
+# Time that a server gets to end its connections before it is removed, in seconds: robots move within 5 s.
 _DEREGISTRATION_S = 30
-"""Time that a server gets to end its connections before it is removed."""
 
 
 class LoadBalancer(Construct):

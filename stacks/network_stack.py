@@ -21,16 +21,18 @@ from stacks.values import provide, provide_network
 
 __all__ = ["CIDR", "ZONES", "NetworkStack"]
 
+# Addresses of the VPC.
 CIDR = "10.20.0.0/16"
-"""Of the VPC."""
+# Availability zones that the network spans: a load balancer needs two.
 ZONES = 2
-"""That the network spans; a load balancer needs two."""
-
-_FIRST_ANSWER_PORT, _LAST_PORT = 1024, 65535
+# Ephemeral ports, to which answers go; access lists keep no connection state.
+_FIRST_ANSWER_PORT = 1024
+_LAST_PORT = 65535
 _HTTPS = 443
-_UNREACHABLE, _TOO_BIG = 3, 4
-"""ICMP type and code by which a router tells the largest packet that it forwards (RFC 1191)."""
-_WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1); they stand behind security groups"
+# ICMP type and code by which a router reports the largest packet that it forwards (RFC 1191).
+_UNREACHABLE = 3
+_TOO_BIG = 4
+_WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1), in addition to security groups"
 
 
 class NetworkStack(cdk.Stack):
@@ -117,7 +119,7 @@ class NetworkStack(cdk.Stack):
         self._entry(back, "Answers", 120, anywhere, answers, inward=True)
         self._entry(back, "Https", 100, anywhere, https, inward=False)
         self._entry(back, "ToInside", 110, inside, answers, inward=False)
-        # "Fragmentation needed": without it, large messages over a VPN or a cellular network just vanish.
+        # "Fragmentation needed": without it, large messages over a VPN or a cellular network are lost.
         too_big = ec2.AclTraffic.icmp(type=_UNREACHABLE, code=_TOO_BIG)
         for of, peer in ((front, robots), (back, anywhere)):
             self._entry(of, "MtuIn", 140, peer, too_big, inward=True)

@@ -1,7 +1,6 @@
-"""Monitoring for the operator: a dashboard of the boxes of Fig. 2, alarms with a runbook each, and a budget.
+"""Monitoring for the operator: a dashboard of the boxes of Fig. 2, alarms with runbooks, and a budget.
 
-The alarms here notify people; they do not scale the group.  What they measure is in
-`rse_pf.scaling.operator_alarms`.
+The alarms here notify an operator and do not scale the group; `rse_pf.scaling.operator_alarms` defines them.
 """
 
 from __future__ import annotations
@@ -31,11 +30,17 @@ from stacks.values import read
 
 __all__ = ["ObservabilityStack"]
 
+# Width of a graph: half of the dashboard's 24 columns.
 _WIDTH = 12
-_ALB, _EC2, _GROUP, _LAMBDA, _S3 = (
-    "AWS/ApplicationELB", "AWS/EC2", "AWS/AutoScaling", "AWS/Lambda", "AWS/S3",
-)  # fmt: skip
-_BUDGET_ACTUAL_PERCENT, _BUDGET_FORECAST_PERCENT = 80, 100
+# Namespaces of AWS.
+_ALB = "AWS/ApplicationELB"
+_EC2 = "AWS/EC2"
+_GROUP = "AWS/AutoScaling"
+_LAMBDA = "AWS/Lambda"
+_S3 = "AWS/S3"
+# Shares of the budget whose use, or forecast use, notifies the topic: early enough to act in the same month.
+_BUDGET_ACTUAL_PERCENT = 80
+_BUDGET_FORECAST_PERCENT = 100
 
 Dimensions = Mapping[str, str]
 
@@ -81,7 +86,7 @@ class ObservabilityStack(cdk.Stack):
             self._budget(names, settings.cloud.budget_per_month, topic)
 
     def _dashboard(self, names: ResourceNames, settings: PlatformSettings) -> None:
-        """Show each box of Fig. 2 in a row of its own, with what it does and what is wrong with it."""
+        """Show each box of Fig. 2 in a row of its own, with its load and its faults."""
         of = self._metric
         rows: dict[str, dict[str, list[cloudwatch.IMetric]]] = {
             "Firewall": {
@@ -193,9 +198,9 @@ class ObservabilityStack(cdk.Stack):
         )  # fmt: skip
 
     def _budget(self, names: ResourceNames, usd: float, topic: str) -> None:
-        """Tell the topic when the account's month has cost, or will cost, too much.
+        """Notify the topic when the account's costs of a month exceed, or will exceed, the budget.
 
-        Of the whole account: AWS tells costs apart by a tag only after the tag was activated by hand.
+        It covers the whole account: AWS separates costs by a tag only after the tag was activated by hand.
         """
         budgets.CfnBudget(
             self, "Budget",

@@ -21,9 +21,9 @@ __all__ = ["BY_AWS", "LOG_ACTIONS", "USED_BY", "allow", "explain"]
 USED_BY = "rse-pf:used-by"
 """The type of the construct metadata that holds the records; it is written to the assembly's manifest."""
 BY_AWS = "aws: "
-"""What ``used_by`` begins with where a service of AWS makes the call itself; the reason follows."""
+"""Prefix of ``used_by`` where a service of AWS makes the call itself; the reason follows."""
 LOG_ACTIONS = ("logs:CreateLogStream", "logs:PutLogEvents")
-"""That the CDK grants to the writers of a log group."""
+"""Actions that the CDK grants to the writers of a log group."""
 
 
 def allow(
@@ -40,7 +40,7 @@ def allow(
     Args:
         role: A role of the same stack.
         actions: Names such as ``s3:GetObject``; no wildcards.
-        resources: ARNs, or ``*`` for actions that know no resources.
+        resources: ARNs, or ``*`` for actions that take no resources.
         used_by: ``path/of/file.py:function`` or ``path/of/file.py:Class.method``, or the file alone if it has
             one purpose; one or more.  Each action is called by at least one of them.  `BY_AWS` and a reason
             where a service makes the call.

@@ -1,8 +1,8 @@
-"""Copy what makes an identity valid, and maps, to the buckets of deployments in other regions.
+"""Copy keys, roster, deny list, services and maps to the buckets of deployments in other regions.
 
-One deployment is the home: operators enrol robots, rotate keys and publish services there.  S3 copies public
-keys, roster, deny list, published services and versions of maps to the others, one way.  Live maps, jobs and
-robots' objects stay where they are: a lease must have one home.
+One deployment is the primary one: operators enrol robots, rotate keys and publish services there.  S3 copies
+public keys, roster, deny list, published services and versions of maps to the others, one way.  Live maps,
+jobs and robots' objects are not copied: a lease is valid in one region only.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from stacks.permissions import BY_AWS, allow
 __all__ = ["ARTIFACT_PREFIXES", "MAP_PREFIXES", "Replication"]
 
 ARTIFACT_PREFIXES = (KEYS_NAME, "control/", f"{SERVICES_PREFIX}/")
-"""Of what is copied from the artifact bucket; `rse_pf.auth.trust_store` writes below ``control/``."""
+"""Prefixes that are copied from the artifact bucket; `rse_pf.auth.trust_store` writes below ``control/``."""
 MAP_PREFIXES = ("maps/",)
-"""Of what is copied from the map bucket: versions and heads, not ``live/``."""
+"""Prefixes that are copied from the map bucket: versions and heads, not ``live/``."""
 _BY_S3 = f"{BY_AWS}S3 copies the objects of a replication rule in this role"
 
 

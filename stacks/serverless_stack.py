@@ -1,7 +1,7 @@
-"""Pose estimation without a server: `lambda_pnp` behind the load balancer, for what the servers cannot take.
+"""Pose estimation without a server: `lambda_pnp` behind the load balancer, for commands beyond the servers.
 
 Robots reach it at their own address, so that one name, one certificate and one web firewall are in front of
-servers and function alike; nobody else may invoke it.
+servers and function; only the load balancer may invoke it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from stacks.values import import_bucket, read
 
 __all__ = ["ServerlessStack"]
 
+# Priority of the rule of the listener: rules of the data service and of rosbridge have smaller numbers.
 _PRIORITY = 20
-"""Of the rule of the listener; those of the data service come first."""
 
 
 class ServerlessStack(cdk.Stack):
@@ -84,12 +84,12 @@ class ServerlessStack(cdk.Stack):
                 service="elasticloadbalancing", resource="targetgroup", resource_name=f"{names.function}/*"
             ),
         )  # fmt: skip
-        # No health checks, which would be calls that are paid for.
+        # No health checks: each would be a paid call.
         targets = elbv2.CfnTargetGroup(
             self, "Targets", name=names.function, target_type="lambda", health_check_enabled=False,
             targets=[elbv2.CfnTargetGroup.TargetDescriptionProperty(id=function.function_arn)],
             target_group_attributes=[
-                # A header that comes twice is told as such, and not judged by one of its values.
+                # The function receives all values of a repeated header, and can refuse it.
                 elbv2.CfnTargetGroup.TargetGroupAttributeProperty(
                     key="lambda.multi_value_headers.enabled", value="true"
                 )

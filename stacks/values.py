@@ -2,7 +2,7 @@
 
 CloudFormation's exports are not used: it refuses to change or remove an export as long as another stack
 imports it, so that a switch such as ``data.enabled`` could be turned on and never off again.  A parameter
-may change or vanish at any time; the reader sees it at its own next update.
+may change or be removed at any time; the reader sees it at its own next update.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The web application firewall in front of the load balancer: how fast one address may ask for what.
+"""The web application firewall in front of the load balancer: rate limits of each address.
 
 The limits come from `rse_pf.config.front_door`.  Blocked requests get 429 with ``Retry-After`` and never 403:
-a robot must be able to tell a firewall that it should wait for from a server that refuses it for good.
-Commands for the burst function must carry what looks like a token, because each call of it is paid; this is
-judged first, so that what is blocked for want of a token does not count in the rate of all robots.
+robots retry after 429, and treat 403 as the permanent refusal of a server.
+Commands for the burst function must carry what looks like a token, because each call of it is paid; this rule
+comes first, so that requests without a token do not count in the rate of all robots.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rse_pf.config.resource_names import ResourceNames
 __all__ = ["WebFirewall"]
 
 _BODY = "too-fast"
-_TOLD = {
+_BODY_TEXT = {
     "code": "quota",
     "message": "too many requests",
     "hint": (
@@ -35,8 +35,10 @@ _TOLD = {
         "and burst.commands_per_5_minutes for commands sent to the function"
     ),
 }
-_NO_TOKEN, _NO_TOKEN_BODY, _NO_TOKEN_STATUS = "burst-needs-a-token", "no-token", 401
-_NO_TOKEN_TOLD = {
+_NO_TOKEN = "burst-needs-a-token"
+_NO_TOKEN_BODY = "no-token"
+_NO_TOKEN_STATUS = 401
+_NO_TOKEN_TEXT = {
     "code": "unauthorized", "message": "the token is missing or not valid",
     "hint": "issue one with rse-pf token issue ROBOT",
 }  # fmt: skip
@@ -55,10 +57,10 @@ class WebFirewall(Construct):
             default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
             custom_response_bodies={
                 _BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
-                    content=json.dumps(_TOLD), content_type="APPLICATION_JSON"
+                    content=json.dumps(_BODY_TEXT), content_type="APPLICATION_JSON"
                 ),
                 _NO_TOKEN_BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
-                    content=json.dumps(_NO_TOKEN_TOLD), content_type="APPLICATION_JSON"
+                    content=json.dumps(_NO_TOKEN_TEXT), content_type="APPLICATION_JSON"
                 ),
             },
             rules=[

@@ -1,4 +1,4 @@
-"""The operator's AWS account: clients of one region, and calls whose errors are sentences with a hint.
+"""The operator's AWS account: clients of one region, and calls that raise errors with a hint.
 
 Missing credentials are reported at once; no call lasts longer than `rse_pf.aws.clients` allows.
 """
@@ -74,8 +74,8 @@ class Account:
         answer = self.find(service, method, **arguments)
         if answer is None:
             raise ConfigurationError(
-                f"AWS refuses {service} {method}: it is not there, or cannot be changed so",
-                hint="rse-pf cloud status shows what there is; then repeat the command",
+                f"AWS refuses {service} {method}: it does not exist, or cannot be changed this way",
+                hint="rse-pf cloud status shows what exists; then repeat the command",
             )
         return answer
 
@@ -133,6 +133,6 @@ def open_account(region: str) -> Account:
 
 def _page_tokens(paginator: Any) -> tuple[str, str]:
     """Return the names of a call's page token, as an argument and in the answer."""
-    config = paginator._pagination_cfg  # botocore publishes them nowhere else
+    config = paginator._pagination_cfg  # botocore has no public name for them
     into, out = config["input_token"], config["output_token"]
     return (into, out) if isinstance(into, str) else (into[0], out[0])

@@ -25,13 +25,20 @@ __all__ = [
     "with_retries",
 ]
 
+# Attempts of one call: two failures in a row are rare unless AWS itself is unavailable.
 MAX_TRIES = 3
+# No attempt begins that could end later than this after the first one, in seconds: callers have deadlines.
 MAX_S = 10.0
-_CONNECT_S, _READ_S = 1.0, 3.5
+# Time limit of a connection, in seconds: within a region a handshake takes milliseconds.
+_CONNECT_S = 1.0
+# Time limit of an answer, in seconds: with the connections and pauses, two attempts fit into `MAX_S`.
+_READ_S = 3.5
+# Pause before the second attempt, in seconds; the next one is twice as long.
 FIRST_PAUSE_S = 0.1
+# HTTP status: too many requests.
 _THROTTLED = 429
-# Error codes of AWS that ask for a retry; most of them come with status 400, the last two with 409: S3 did
-# nothing because of another write of the same name, which may fail, and then nothing is stored.
+# Error codes of AWS that allow a retry.  Most come with status 400, the last two with 409: S3 stored nothing
+# because another write of the same name was in progress, and that write may fail.
 _TEMPORARY = frozenset(
     {
         "Throttling", "ThrottlingException", "ThrottledException", "RequestThrottled",
@@ -66,9 +73,9 @@ def make_client(service: str, region: str) -> Any:
 
 
 def _addressing() -> str:
-    """Return how the address names a bucket: in the host at AWS, in the path where an emulator is named."""
-    is_named = any(os.environ.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"))
-    return "path" if is_named else "virtual"
+    """Return where the address names a bucket: in the host, or in the path of an emulator's address."""
+    is_emulated = any(os.environ.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"))
+    return "path" if is_emulated else "virtual"
 
 
 @functools.cache
@@ -117,7 +124,7 @@ def _describe_error(error: Any) -> str:
     if "<" not in text and "\n" not in text:
         return text
     status = status_of(error) if hasattr(error, "response") else 0
-    return f"HTTP status {status}" if status else f"{type(error).__name__}, an answer that is none of AWS"
+    return f"HTTP status {status}" if status else f"{type(error).__name__}, the answer is not one of AWS"
 
 
 def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a deployment on AWS consists of beyond its settings: what the stacks build, and what a bill counts."""
+"""Constants of a deployment on AWS that the stacks build with and that an estimate of cost counts."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ __all__ = [
     "LOG_DAYS",
     "ON_DEMAND_SERVERS",
     "RESUME_FIELD",
+    "VOLUME_GB",
     "parks_when_idle",
     "zone_count",
 ]
 
-# Memory of the serverless PnP: AWS gives it one whole vCPU, and a command uses no second one.
+# Memory of the serverless PnP: with it AWS gives one whole vCPU, and a command uses one.
 LAMBDA_MEMORY_MB = 1769
 # Memory of the canary's function: a third of a vCPU, with which a start and one pose fit into its time limit.
 CANARY_MB = 512
@@ -30,14 +31,16 @@ LOG_DAYS = 30
 DELETED_DAYS = 30
 # Servers that are never Spot instances: robots have one place to go when AWS takes all others back.
 ON_DEMAND_SERVERS = 1
+# Size of the volume of a server: Debian, the environment of Python, and the logs of some days.
+VOLUME_GB = 8
 # Hours without robots after which a deployment is idle: a whole day, so that a night alone parks nothing.
 IDLE_HOURS = 24
 ENDPOINT_SERVICES = {"monitoring": "monitor", "autoscaling": "scale modifier"}
 """The interface endpoints of the VPC: the service of AWS, and the box of Fig. 2 that uses it.
 
 Without them the agents reach neither the monitor nor the group; S3 has a gateway endpoint, which is free."""
+# Field of an event of the schedule: the least number of servers with which the deployment is resumed.
 RESUME_FIELD = "min_servers"
-"""In an event of the schedule for the function that parks: resume, with so many servers at least."""
 
 
 def zone_count(settings: PlatformSettings) -> int:

@@ -1,4 +1,4 @@
-"""Watch the disks of a local platform: warn before one is full, and refill the disk reserve of its roster.
+"""Watch the disks of a local platform: warn before one is full, and refill the disk reserve of the roster.
 
 Servers are neither started nor replaced while the disk of the state folder is full: their logs and
 announcements could not be written.
@@ -28,7 +28,7 @@ __all__ = [
 
 Level = Literal["ok", "low", "full"]
 
-# Time between two looks at the disks; work that waits for space continues so soon after there is some.
+# Time between two checks of the disks, in seconds; work that waits for space continues at the next check.
 LOOK_S = 0.5
 # Below this free space a disk counts as full: a server that starts writes about as much.
 _FULL_BYTES = 1 << 20

@@ -112,7 +112,7 @@ def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
 
 
 def _holds_key(public: Path, key: SigningKey) -> bool:
-    """Whether the set in the file *public* holds *key*, perhaps beside others."""
+    """Return whether the set in the file *public* holds *key*."""
     try:
         public_key = KeySet.from_json(public.read_text(encoding="utf-8")).get(key.key_id)
     except (OSError, UsageError):

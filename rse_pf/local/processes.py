@@ -43,17 +43,24 @@ __all__ = [
     "wait_ended",
 ]
 
+# Bytes at the end of a log in which its last line is searched.
 _TAIL_BYTES = 8192
-_LOOK_AGAIN_S = 0.01
+# Time between two checks whether a process has announced itself, in seconds.
+_POLL_S = 0.01
+# Time between two checks of the sizes of logs, in seconds.
 _ROTATE_EVERY_S = 5.0
-_MAX_LOGS, _MAX_LOGS_BYTES = 200, 1 << 30
+# Logs of servers that are kept: hours of a crash loop.
+_MAX_LOGS = 200
+# Size of all logs of servers together.
+_MAX_LOGS_BYTES = 1 << 30
+# Free space below which a disk counts as full when a process has logged nothing.
 _FULL_BYTES = 1 << 16
+# Time between two searches for orphans, in seconds: any waiting parent reaps its child sooner.
 _REAP_EVERY_S = 2.0
-"""Between two looks for orphans: whoever waits for a child has reaped it long before the second look."""
 _spawned: weakref.WeakValueDictionary[int, subprocess.Popen[bytes]] = weakref.WeakValueDictionary()
-"""What `spawn` started, by pid: whoever holds the child reaps it, however late."""
+"""Children of `spawn` by pid; the holder of a child reaps it, however late."""
+# Time that a process gets to end after a request, in seconds; then it is killed.
 STOP_TIMEOUT_S = 10.0
-"""A process that has not ended so long after it was asked to is killed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,7 +245,7 @@ class ServerProcess:
                 raise self.failed(self.ending())
             if time.monotonic() >= end:
                 raise self.failed(f"was not ready within {timeout_s:g} s")
-            await asyncio.sleep(_LOOK_AGAIN_S)
+            await asyncio.sleep(_POLL_S)
         document: dict[str, Any] = json.loads(self.announcement.read_text(encoding="utf-8"))
         if self.mark is None or document["pid"] != self.mark.pid:
             started = "nothing" if self.mark is None else self.mark.pid
@@ -409,7 +416,7 @@ def _child_setup(parent: int | None) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def _handle(mark: ProcessMark) -> Iterator[int | None]:
-    """Yield a handle that is certain to mean the marked process, or None if it is gone."""
+    """Yield a handle of exactly the marked process, or None if it has ended."""
     try:
         handle = os.pidfd_open(mark.pid)
     except ProcessLookupError:

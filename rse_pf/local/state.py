@@ -38,8 +38,8 @@ __all__ = [
 
 _FILE = "platform.json"
 _LOCK = "lock"
-_LATER = ("lan", "authority_file", "rosbridge_server")
-"""Left out while they are empty: earlier versions refuse fields that they do not know."""
+_OPTIONAL = ("lan", "authority_file", "rosbridge_server")
+"""Fields that are left out while they are empty: earlier versions refuse unknown fields."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 
 
@@ -81,13 +81,13 @@ class PlatformState:
     authority_file: str = ""
 
     def processes(self) -> tuple[ProcessMark, ...]:
-        """Return the data path: everything but the control plane."""
+        """Return all processes but the control plane."""
         balancer = () if self.load_balancer is None else (self.load_balancer,)
         return (*(server.process for server in (*self.servers, *self.single_servers)), *balancer)
 
     @property
     def single_servers(self) -> tuple[ServerState, ...]:
-        """Data server and rosbridge server, as far as there are such."""
+        """Data server and rosbridge server, if they exist."""
         both = (self.data_server, self.rosbridge_server)
         return tuple(server for server in both if server is not None)
 
@@ -98,7 +98,7 @@ class PlatformState:
     def to_json(self) -> str:
         """Return the content of the file."""
         document = asdict(self)
-        for name in _LATER:
+        for name in _OPTIONAL:
             if not document[name]:
                 del document[name]
         return json.dumps(document, indent=2) + "\n"

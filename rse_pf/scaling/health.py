@@ -1,7 +1,6 @@
-"""The health of a server by its checks, as in a target group, and for how long a server may drain.
+"""The health of a server by its checks, as in a target group of the ALB.
 
-Consecutive results decide, after a grace period.  The ALB, Envoy and this rule use the same settings.  The
-result of a check and the time are arguments.
+Consecutive results decide, after a grace period.  The ALB, Envoy and this rule use the same limits.
 """
 
 from __future__ import annotations
@@ -28,26 +27,31 @@ __all__ = [
     "time_to_notice_s",
 ]
 
+# Successful checks in a row after which a server is healthy: the least that the ALB offers.
 HEALTHY_CHECKS = 2
-"""Good checks in a row that bring a server in."""
-LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S = 0.25, 0.25
-"""Time between checks on one machine; a check that takes longer than the second failed."""
-CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S = 5, 4
-"""Time between checks of the ALB, the least it offers; a check that takes longer than the second failed."""
-# Failed checks of a new server do not count for this long: its boot and start of 60 s, and some more.
+# Seconds between two checks on one machine: a crash is noticed within half a second.
+LOCAL_INTERVAL_S = 0.25
+# Time limit of a check on one machine, in seconds.
+LOCAL_TIMEOUT_S = 0.25
+# Seconds between two checks of the ALB: the least that it offers.
+CLOUD_INTERVAL_S = 5
+# Time limit of a check of the ALB, in seconds: it must be shorter than the interval.
+CLOUD_TIMEOUT_S = 4
+# Seconds for which failed checks of a new server do not count: its start of about 75 s, and some more.
 GRACE_S = 90
+# Seconds that the termination hook gives a server to drain.
 DRAIN_S = 60
-"""Time that the termination hook of a cloud gives a server to drain."""
-
+# Largest percentage of the wanted servers while servers are replaced: one more at a time in fleets of up to
+# 19, so that a bad release stops at the first server.
 MAX_HEALTHY_PERCENT = 110
-"""While servers are replaced: one new one more at a time, up to 19 servers, and never fewer than wanted.
-
-So a bad release, or a check that fails on every server at once, stops at the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """The health of one server.  ``row`` counts equal results; the grace period begins at ``started_s``."""
+    """The health of one server.
+
+    ``row`` counts equal results in a row; the grace period begins at ``started_s``.
+    """
 
     started_s: float
     state: Literal["starting", "healthy", "unhealthy"] = "starting"
@@ -56,10 +60,10 @@ class Health:
 
 
 def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
-    """Return port and path that the ALB asks, by target group: ``robots``, and what else runs.
+    """Return port and path of the ALB's check of each target group: ``robots``, and the services that run.
 
-    A server that fails any of them is ended.  Therefore none may depend on what all servers share, such as
-    the bucket: it would end all servers at once.
+    A server that fails any check is replaced.  Therefore no check may depend on anything that all servers
+    share, such as the bucket: its failure would replace all servers at once.
     """
     checks = {"robots": (settings.serving.control_port, READY_PATH)}
     if settings.data.enabled:
@@ -72,8 +76,8 @@ def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
 def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float) -> Health:
     """Return the health after one more check.
 
-    A server becomes healthy after `HEALTHY_CHECKS` good ones in a row, and unhealthy after
-    ``unhealthy_checks`` failed ones; one that was never healthy only after `GRACE_S`.
+    A server becomes healthy after `HEALTHY_CHECKS` successes in a row, and unhealthy after
+    ``unhealthy_checks`` failures; a server that was never healthy becomes unhealthy only after `GRACE_S`.
     """
     row = health.row + 1 if ok == health.last_ok else 1
     state = health.state

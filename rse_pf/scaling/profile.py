@@ -1,4 +1,4 @@
-"""How often the monitor samples, and how many samples each rule of the policy needs, in either profile.
+"""The period of a sample and the number of samples of each rule, in both profiles.
 
 The paper's profile takes ``scaling.period_s`` and `BUSY_PERIODS`; the fast one takes three samples
 of 10 s.  How long a fleet must be idle is the same in both.
@@ -14,9 +14,9 @@ from rse_pf.config.elasticity import FAST_PERIOD_S, FAST_SAMPLES
 
 __all__ = ["REPEAT_S", "Cadence", "cadence_of"]
 
+# Seconds after which a rule that still holds acts again: an alarm repeats a scaling action once a minute,
+# whatever its period is (AWS, "Using Amazon CloudWatch alarms").
 REPEAT_S = 60
-"""A rule that still holds acts again after this: an alarm repeats a scaling action once each minute,
-whatever its period is (AWS, "Using Amazon CloudWatch alarms")."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,12 +41,12 @@ class Cadence:
 
     @property
     def most(self) -> int:
-        """The greatest number of samples that any rule looks back."""
+        """Return the largest number of samples that a rule needs."""
         return max(self.busy, self.idle, self.underused)
 
 
+# Busy samples in a row before the paper's profile grows: a load of one minute ends before a server starts.
 BUSY_PERIODS = 2
-"""Busy samples in a row before the paper's profile grows."""
 
 
 def cadence_of(settings: ScalingSettings) -> Cadence:

@@ -1,8 +1,8 @@
 """Decide how many robots a crowded server moves to others, so that all servers have about the same number.
 
-`moves` is for a caller that knows every server, such as the local control plane; `share` is the same rule for
-one server that only knows the totals, as in AWS.  No robot moves while all servers are within the margin, and
-no more robots move than necessary.
+`moves` is for a caller that has the numbers of every server, such as the local control plane; `share` is the
+same rule for one server that has only the totals, as on AWS.  No robot moves while all servers are within the
+margin, and no more robots move than necessary.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from rse_pf.config.elasticity import MOVES_PER_S
 
 __all__ = ["MARGIN", "MAX_PAUSE_S", "MoveOrder", "Totals", "moves", "pause_after_s", "plan_order", "share"]
 
+# Robots move until all servers are within this share of the mean: moving more gains little.
 MARGIN = 0.2
-"""Crowded servers hand robots over until all are within this share of even."""
+# Longest pause of a server whose robots do not move, in seconds.
 MAX_PAUSE_S = 600.0
-"""The longest pause of a server whose robots do not move."""
-
+# No robot moves while their total changes by more than this share from one period to the next.
 _STEADY_SHARE = 0.1
-"""Of all robots; sums that change by more from one period to the next are not acted on."""
 
 
 def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
@@ -57,7 +56,7 @@ def share(mine: int, total: int, servers: int, margin: float = MARGIN) -> int:
     others have in excess; the margin is therefore divided among them.  For two servers this equals `moves`.
 
     Args:
-        mine: Robots of this server.
+        mine: Number of robots of this server.
         total: Robots of all servers, this one included.
         servers: Number of servers that take part, this one included.
         margin: A share of even.

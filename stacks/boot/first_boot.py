@@ -78,7 +78,7 @@ def verified(data, sha256):
 
 
 def main(facts):
-    """Fetch, verify, install; tell a failure to the console and to the group, which replaces the machine."""
+    """Fetch, verify, install; report a failure to the console and the group, which replaces the machine."""
     try:
         install(facts)
     except BaseException as error:

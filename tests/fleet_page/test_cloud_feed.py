@@ -12,12 +12,12 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
-from rse_pf.extensions.fleet_page.feeds.cloud_metrics import PERIODS, GroupMetrics
-from rse_pf.extensions.fleet_page.feeds.cloud_overview import CloudBalancer, CloudOverview
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, ConfigurationError
 from rse_pf.extensions.fleet_page.cloud_page import serve_cloud_page
 from rse_pf.extensions.fleet_page.feeds.cloud_feed import CloudFeed, cloud_document
+from rse_pf.extensions.fleet_page.feeds.cloud_metrics import PERIODS, GroupMetrics
+from rse_pf.extensions.fleet_page.feeds.cloud_overview import CloudBalancer, CloudOverview
 from rse_pf.extensions.fleet_page.hub import Hub
 
 SETTINGS = PlatformSettings()

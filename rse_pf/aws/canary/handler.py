@@ -2,7 +2,7 @@
 
 A schedule calls it each minute.  It is an enrolled robot with a key of its own in a secret that only it may
 read, and with the scope services:pnp; it can sign nothing for another robot.  A failed execution is a data
-point of the function's metric Errors, on which the alarm `canary` goes; one log line says what happened.
+point of the function's metric Errors, which the alarm `canary` reads; one log line says what failed.
 """
 
 from __future__ import annotations
@@ -38,12 +38,17 @@ __all__ = ["ask_known_pose", "handler", "read_key"]
 
 _ROOT = Path(__file__).resolve().parents[3]
 _CODEC = "zlib"
+# Time limit of the connection, the handshake and the answer together, in seconds.
 _TIMEOUT_S = 10.0
-_CLOSE_S = 1.0  # limit of the closing handshake; the answer is known before it
+# Time limit of the closing handshake, in seconds; the answer has been received before.
+_CLOSE_S = 1.0
 _HINT = "look at the load balancer's target groups and the servers' journals"
-_SEED, _MAX_ERROR = 20260101, 0.02
+# Seed of the problem: the same in every call, so that its answers can be compared.
+_SEED = 20260101
+# Largest error of an element of the pose; the error of this problem is 0.001.
+_MAX_ERROR = 0.02
 _KEYS: dict[str, SigningKey] = {}
-"""Read once in the life of an execution environment."""
+"""The canary's key by secret; it is read once in each execution environment."""
 
 
 def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
@@ -52,7 +57,7 @@ def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
     try:
         outcome = _ask(os.environ, settings, trace)
     except RsePfError as error:
-        _KEYS.clear()  # it may have been replaced
+        _KEYS.clear()  # the key may have been replaced
         _log(event="canary-failed", trace=trace, code=error.code, error=error.message[:200])
         raise
     _log(event="canary-solved", trace=trace, **outcome)
@@ -68,13 +73,13 @@ def read_key(secret: str, region: str) -> SigningKey:
 def ask_known_pose(
     url: str, token: str, settings: PlatformSettings, *, trace: str, clock: Callable[[], float]
 ) -> dict[str, Any]:
-    """Ask for the pose of one seeded problem at *url*; return the server, the time in ms and the error.
+    """Ask for the pose of one seeded problem at *url*; return server, round-trip time in ms, and error.
 
     Args:
         url: Of the load balancer, such as ``wss://robots.example.org/ws``.
         token: Of the canary's robot.
         settings: Limits of the session.
-        trace: Written to the server's log beside the command.
+        trace: Trace id, which the server logs with the command.
         clock: Monotonic seconds.
 
     Raises:
@@ -89,7 +94,7 @@ def ask_known_pose(
     address = urlsplit(url)
     host, port = address.hostname or "", address.port or (443 if address.scheme == "wss" else 80)
     try:
-        # With a socket of ours the library follows no redirect, as robots do not.
+        # With a socket of its own the library follows no redirect; robots follow none either.
         stream = socket.create_connection((host, port), timeout=_TIMEOUT_S)
         with connect(
             url, sock=stream, subprotocols=[Subprotocol(SUBPROTOCOLS[_CODEC])], compression=None,

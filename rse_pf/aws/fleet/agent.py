@@ -3,9 +3,9 @@
     python -m rse_pf.aws.fleet.agent --settings FILE --bucket B --keys-file FILE --state FOLDER
         --group G --hook H
 
-Without it the idle alarm never fires and a scale-in disconnects robots.  A task that fails writes one line to
-the log and is repeated; the other tasks go on.  The agent writes public keys, roster and deny list; the only
-secret it writes is the token of the control port, which never leaves the machine.
+Without the agent the idle alarm never fires, and a scale-in disconnects robots.  A task that fails writes one
+line to the log and is repeated; the other tasks continue.  The agent writes public keys, roster and deny
+list; the only secret it writes is the token of the control port, which never leaves the machine.
 """
 
 from __future__ import annotations
@@ -59,11 +59,13 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
 )
 """The table, in the order of a step: one row and one module for each task."""
 
+# Time between two steps, in seconds: the shortest period of a task without a thread of its own.
 _STEP_S = 1.0
+# File whose existence says that keys and access control were fetched since the machine booted.
 _FETCHED = "fetched"
 
 SERVICES = ("autoscaling", "cloudwatch")
-"""The AWS services whose clients the tasks use, beside the buckets."""
+"""The AWS services whose clients the tasks use, in addition to S3."""
 
 
 class Agent:
@@ -108,7 +110,7 @@ class Agent:
             sleep(task.period_s)
 
     def start_threads(self) -> None:
-        """Start a thread for each task that wants one."""
+        """Start a thread for each task with ``in_thread``."""
         for task in self._tasks.values():
             if task.in_thread:
                 threading.Thread(target=self.repeat, args=(task.name,), daemon=True).start()
@@ -172,11 +174,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fetch(agent: Agent, mark: Path) -> None:
-    """Fetch keys and access control before a start of the server; the file *mark* says that it was done.
+    """Fetch keys and access control before a start of the server; the file *mark* records a success.
 
-    A server that starts again while S3 is away takes what was fetched since the machine has started, just
-    as running servers do.  Nothing older is there: a machine of the warm pool may have been off for weeks,
-    and the folder of the keys, where *mark* lies, is empty after each boot.
+    A server that restarts while S3 does not answer uses what was fetched since the boot, as running servers
+    do.  Older files do not exist: a machine of the warm pool may have been off for weeks, and the folder of
+    the keys, which also holds *mark*, is empty after each boot.
 
     Raises:
         RsePfError: They could not be fetched in this boot.

@@ -1,8 +1,9 @@
 """Take an instance out of its group without losing robots: drain the server before the machine ends.
 
-Auto Scaling names the new target state when the instance begins to leave, which is before the load balancer
-has deregistered it; the hook waits only after that.  So the drain begins at once and the hook is completed
-as soon as it waits, in any case well before its own timeout, even if no server is running.
+1. Auto Scaling publishes the target state ``Terminated``, and the drain begins.
+2. The load balancer deregisters the instance.
+3. The hook starts to wait, and is completed as soon as the server has ended, or shortly before the hook's own
+   time limit; also if no server runs.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from rse_pf.scaling.health import DRAIN_S, time_to_notice_s
 
 __all__ = ["drain_server"]
 
+# Time between two checks whether the server has ended, in seconds.
 _POLL_S = 0.5
-# Kept of the hook's time for the call that completes it, with its retries.
+# Part of the hook's time, in seconds, that is reserved for the call that completes it, with its retries.
 _RESERVE_S = 15.0
 
 

@@ -17,7 +17,8 @@ from rse_pf.scaling.alarms import NAMESPACE
 
 __all__ = ["AutoScalingGroup", "Server", "read_group"]
 
-_PERIODS = 3
+# A number of robots that is older than this many periods is unknown.
+_FRESH_PERIODS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +34,7 @@ class Server:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutoScalingGroup:
-    """Everything `rse-pf cloud status` shows, and why each alarm has its state."""
+    """The state of the group for ``rse-pf cloud status``; ``reasons`` explain the states of alarms."""
 
     min_servers: int
     wanted_servers: int
@@ -61,10 +62,10 @@ def read_group(
     """Return the state of the group at *now*, in UTC.
 
     Args:
-        account: Whose group.
+        account: Of the group.
         settings: Of the platform.
         now: In UTC.
-        asks_robots: Whether the metrics are asked, too, which AWS charges for.
+        asks_robots: Whether numbers of robots are read, too; AWS charges for them.
 
     Raises:
         ConfigurationError: There is no group in the region, or AWS refused.
@@ -136,7 +137,7 @@ def _read_robots(
     results = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=queries, ScanBy="TimestampDescending",
-        StartTime=end - timedelta(seconds=_PERIODS * period_s), EndTime=end,
+        StartTime=end - timedelta(seconds=_FRESH_PERIODS * period_s), EndTime=end,
     )  # fmt: skip
     newest: dict[str, float] = {}
     for row in results:

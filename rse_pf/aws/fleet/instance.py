@@ -18,15 +18,21 @@ from rse_pf.errors import Disconnected, UsageError
 
 __all__ = ["INTERRUPTION", "IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
 
-IN_SERVICE, TERMINATED, WARMED = "InService", "Terminated", "Warmed:"
-"""Target lifecycle states; the last is what those of a warm pool begin with."""
+# Target lifecycle state of an instance that serves.
+IN_SERVICE = "InService"
+# Target lifecycle state of an instance that is removed.
+TERMINATED = "Terminated"
+# Prefix of the target lifecycle states of a warm pool.
+WARMED = "Warmed:"
 
 INTERRUPTION = "interruption"
 """The notice that a Spot instance is taken back within two minutes."""
 
 _STAT = Path("/proc/stat")
 _IMDS = "http://169.254.169.254/latest/"
+# Validity of a token for the instance metadata; each token is used at once.
 _TOKEN_TTL_S = "60"
+# Time limit of a request to this machine, in seconds.
 _TIMEOUT_S = 2.0
 _NOT_FOUND = 404
 
@@ -83,7 +89,7 @@ class Instance:
         """Have the server ask *robots* of its robots to move within *spread_s*; return how many it asks.
 
         Raises:
-            Disconnected: No server runs, it drains, or what answers is no server of ours.
+            Disconnected: No server runs, it drains, or the answer is not one of a backend server.
         """
         text = self._ask(f"/move?robots={robots}&spread_s={spread_s:g}", "POST")
         try:
@@ -96,7 +102,7 @@ class Instance:
         self._ask("/services", "POST")
 
     def cpu_times(self) -> tuple[float, float]:
-        """Return how long the machine's processors worked, and how long they were there; in ticks."""
+        """Return the busy time and the total time of the machine's processors, in ticks."""
         return read_cpu_times(_STAT.read_text(encoding="ascii"))
 
     def spot_notice(self) -> str:

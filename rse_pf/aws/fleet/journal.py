@@ -1,4 +1,4 @@
-"""Read this machine's journal: what the server, the agent, the data service and the boot wrote.
+"""Read this machine's journal: the output of the server, the agent, the data service and the boot.
 
 Entries come as systemd exports them in JSON, one a line, and become lines of text.  The cursor of the last
 entry says where the next reading begins.
@@ -19,7 +19,8 @@ UNITS = (
     "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service",
     "rse-pf-rosbridge.service", "cloud-init.service", "cloud-final.service",
 )  # fmt: skip
-"""Whose entries are read; the last two are the boot, with what first_boot.py and install.py print."""
+"""Units whose entries are read; the last two hold the output of first_boot.py and install.py."""
+# Size of one piece of a journal: it uploads in less than a second.
 _MAX_BYTES = 1 << 22
 _FIELDS = "_SYSTEMD_UNIT,UNIT,MESSAGE"
 

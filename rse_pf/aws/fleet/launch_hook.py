@@ -1,6 +1,6 @@
 """Decide when a new instance may join its group: it must answer its readiness checks within its budget.
 
-The hook's default result is ABANDON, so a machine that says nothing is replaced and never gets a robot.
+The hook's default result is ABANDON, so a machine that does not report is replaced and never gets a robot.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from rse_pf.errors import ConfigurationError
 __all__ = ["LaunchAction", "complete_hook", "launch_action"]
 
 _NOT_ACTIVE = "ValidationError"
-"""What Auto Scaling answers where no lifecycle action waits for this instance."""
+"""Error code of Auto Scaling if no lifecycle action waits for this instance."""
 
 
 class LaunchAction(Enum):
-    """What an agent does about the launch hook."""
+    """What an agent does with the launch hook."""
 
     WAIT = "WAIT"
     CONTINUE = "CONTINUE"

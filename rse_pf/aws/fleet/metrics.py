@@ -22,8 +22,8 @@ ROBOTS = "Robots"
 _LINE = re.compile(r"^rse_pf_(\w+?)(?:\{(.*)\})? (\S+)$", flags=re.M)
 _LABEL = re.compile(r'(\w+)="([^"]*)"')
 _INF = "+Inf"
-# An answer slower than the last bound counts as twice that bound.
-_BEYOND = 2.0
+# An answer slower than the last bound counts as this many times that bound.
+_BEYOND_FACTOR = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,7 @@ def read_page(text: str) -> ServerMetrics:
         else:
             totals[f"{name} {values['direction']}" if "direction" in values else name] += float(value)  # type: ignore[assignment]
     if bounds_ms:
-        answers[max(bounds_ms) * _BEYOND] = answers.pop(float("inf"))
+        answers[max(bounds_ms) * _BEYOND_FACTOR] = answers.pop(float("inf"))
     return ServerMetrics(
         robots=totals["robots"],
         in_flight=totals["in_flight"],
@@ -74,9 +74,9 @@ def read_page(text: str) -> ServerMetrics:
 
 
 def read_cpu_times(stat: str) -> tuple[float, float]:
-    """Return how long the processors worked and how long they were there, in ticks, from /proc/stat.
+    """Return the busy time and the total time of the processors, in ticks, from /proc/stat.
 
-    Time that the hypervisor took away counts as work, as in CPUUtilization of EC2.
+    Time that the hypervisor took away counts as busy, as in CPUUtilization of EC2.
     """
     user, nice, system, idle, waiting, *others = (float(ticks) for ticks in stat.splitlines()[0].split()[1:9])
     busy = user + nice + system + sum(others)
@@ -90,7 +90,7 @@ def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
 
 
 def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
-    """Return the MetricData for PutMetricData: what instance *server* did between two samples.
+    """Return the MetricData for PutMetricData of instance *server* between two samples.
 
     Crashes of native code and disks that are nearly full are left out while there are none: their metrics
     then cost nothing.
@@ -103,11 +103,11 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
         "BytesIn": (_counter_growth(before.bytes_in, now.bytes_in), "Bytes"),
         "BytesOut": (_counter_growth(before.bytes_out, now.bytes_out), "Bytes"),
     }
-    troubles = {
+    faults = {
         NATIVE_CRASHES: _counter_growth(before.worker_crashes, now.worker_crashes),
         DISK_LOW: float(now.disk_free_percent < LOW_DISK_PERCENT),
     }
-    values.update({name: (value, "Count") for name, value in troubles.items() if value})
+    values.update({name: (value, "Count") for name, value in faults.items() if value})
     dimensions = dimensions_of(group)
     data: list[dict[str, Any]] = [
         {"MetricName": name, "Dimensions": dimensions, "Value": value, "Unit": unit}

@@ -1,6 +1,6 @@
-"""Show an operator what servers logged: pieces of their journals in the bucket, or the console of a boot.
+"""Read the logs of servers for an operator: their journals in the bucket, or the console of a boot.
 
-Reads only.
+Nothing is changed.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from rse_pf.storage.object_store import ObjectStore
 __all__ = ["LoggedServer", "console_of", "last_lines", "list_logged_servers", "open_journals"]
 
 _PIECE = re.compile(rf"{JOURNAL_PREFIX}/(?P<server>[A-Za-z0-9-]{{1,64}})/(?P<first_us>\d{{20}})\.log")
+# Newest pieces that are read for one answer: hours of a server, within seconds.
 _MAX_PIECES = 200
-"""Read for one answer, the newest ones."""
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedServer:
-    """A server with journals in the bucket: its instance id, its pieces, and when the newest one begins."""
+    """A server with journals in the bucket: instance id, names of its pieces, and start of the newest one."""
 
     name: str
     pieces: tuple[str, ...]
@@ -37,7 +37,7 @@ def open_journals(account: Account, names: ResourceNames) -> S3Store:
 
 
 def list_logged_servers(store: ObjectStore) -> list[LoggedServer]:
-    """Return the servers with journals in *store*, the one that wrote last first; raises StoreError."""
+    """Return the servers with journals in *store*, most recent first; raises StoreError."""
     pieces: dict[str, list[str]] = {}
     for info in store.list(f"{JOURNAL_PREFIX}/"):
         match = _PIECE.fullmatch(info.name)
@@ -61,7 +61,7 @@ def last_lines(store: ObjectStore, server: LoggedServer, count: int) -> list[str
 
 
 def console_of(account: Account, server: str) -> list[str]:
-    """Return what an instance wrote to its console, which outlives it for an hour; empty if it is unknown.
+    """Return the console output of an instance, which AWS keeps for an hour after its end; empty if unknown.
 
     Raises:
         ConfigurationError: AWS refused.

@@ -1,4 +1,4 @@
-"""What a task of the agent is, and what it may use: one row of the agent's table.
+"""A task of the agent: one row of the agent's table, and the context that tasks share.
 
 A task is made by a function ``task(context)`` of its own module below `rse_pf.aws.fleet.tasks`.  It keeps its
 state in itself, raises RsePfError or OSError when it fails, and is called again after its period.
@@ -23,7 +23,7 @@ __all__ = ["ALWAYS", "AgentConfig", "AgentContext", "AgentState", "Phase", "Task
 
 
 class Phase(Enum):
-    """Where the instance is in its life; `rse_pf.aws.fleet.tasks.lifecycle` moves it."""
+    """Phase of the instance's life cycle; `rse_pf.aws.fleet.tasks.lifecycle` changes it."""
 
     STARTING = "starting"
     """Not in service yet."""
@@ -31,7 +31,7 @@ class Phase(Enum):
     """Prepared in the warm pool; it takes no robots and publishes nothing."""
     SERVING = "serving"
     LEAVING = "leaving"
-    """Drained, or about to be; the hook is not completed yet."""
+    """Draining or drained; the termination hook is not completed yet."""
     LEFT = "left"
 
 
@@ -44,8 +44,8 @@ class AgentConfig:
     """Group and lifecycle hooks of the instance; object name and local file of the public keys.
 
     ``hook`` is completed when the robots are gone, ``launch_hook`` when the server is ready; empty: none.
-    ``keys_file`` lies in memory (tmpfs), so that a full disk keeps no revocation from the server; what must
-    survive a boot lies in ``state_folder``.
+    ``keys_file`` lies in memory (tmpfs), so that a revocation reaches the server also when the disk is full;
+    files that must survive a boot are in ``state_folder``.
     """
 
     group: str
@@ -66,7 +66,7 @@ class AgentState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentContext:
-    """What the tasks share.  ``clients`` maps the name of an AWS service to its boto3 client."""
+    """Objects that tasks share.  ``clients`` maps the name of an AWS service to its boto3 client."""
 
     machine: Instance
     clients: Mapping[str, Any]

@@ -1,9 +1,10 @@
-"""Replace the servers by those of the newest launch template, and take a bad release back.
+"""Replace the servers by those of the newest launch template, and roll a bad release back.
 
-AWS replaces them by an instance refresh: a new server is in service before an old one is drained, an alarm or
-a launch that fails ends the refresh, and the group returns to the version before.  The version then goes into
-the stack's parameter, so that the next deployment names the same one.  Every step can be repeated: a run that
-was interrupted is followed or finished by the next.
+1. AWS replaces the servers by an instance refresh: a new server is in service before an old one is drained.
+2. If an alarm of `WATCHED` fires or a launch fails, AWS returns the group to the previous version.
+3. Otherwise the version is written into the stack's parameter, so that the next deployment keeps it.
+
+Every step can be repeated: an interrupted run is followed or finished by the next one.
 """
 
 from __future__ import annotations
@@ -38,19 +39,22 @@ __all__ = [
 
 WATCHED = ("errors", "unhealthy", "few-servers", "store")
 """Alarms that end an upgrade; one that fires already when it begins is left out."""
+# Time between two reads of the refresh, in seconds: it changes about once a minute.
 POLL_S = 10.0
 _ACTIVE = ("Pending", "InProgress", "Baking", "Cancelling", "RollbackInProgress")
 _ABANDONED = ("Cancelled", "Failed")
 _LIFECYCLE = "Lifecycle Action"
-_LINES = 12
+# Last lines of a console that are shown: an error with its traceback.
+_CONSOLE_LINES = 12
 _NOT_LISTED: Mapping[str, Any] = {"Status": "Pending"}
-"""What a refresh counts as that AWS has just started and does not list yet."""
+"""Stands for a refresh that AWS has just started and does not list yet."""
 _STACK_BUSY = "_IN_PROGRESS"
+# Reads of the stack before an update counts as failed: half an hour.
 _STACK_POLLS = 180
 
 
 class State(Enum):
-    """Where an instance refresh is."""
+    """State of an instance refresh."""
 
     RUNNING = "running"
     ROLLING_BACK = "rolling back"
@@ -60,7 +64,7 @@ class State(Enum):
 
 
 class UpgradeStep(Enum):
-    """What an upgrade has to do next."""
+    """Next step of an upgrade."""
 
     FOLLOW = "follow the refresh that runs"
     REFRESH = "replace the servers"
@@ -112,7 +116,7 @@ def state_of_refresh(refresh: Mapping[str, Any]) -> State:
 def find_failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime) -> Mapping[str, Any] | None:
     """Return the first launch since *since* that was abandoned, None if there is none.
 
-    A launch that failed for want of capacity is none: AWS tries it again, and the release is not at fault.
+    A launch that failed for lack of capacity does not count: AWS repeats it, and no release causes it.
     """
     failed = [
         activity
@@ -135,7 +139,7 @@ def with_version(group: Mapping[str, Any], version: str) -> dict[str, Any]:
 
 
 def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, Any]:
-    """Return how AWS replaces servers: one more before one less, watched by *alarms*, and taken back."""
+    """Return the preferences of a refresh: start before end, watched by *alarms*, with rollback."""
     options: dict[str, Any] = {
         "MinHealthyPercentage": 100,
         "MaxHealthyPercentage": MAX_HEALTHY_PERCENT,
@@ -186,10 +190,10 @@ def upgrade(
     sleep: Callable[[float], None],
     now: Callable[[], datetime],
 ) -> Upgraded:
-    """Bring every server to the newest version, or back to the one before; return which.
+    """Bring every server to the newest version, or back to the previous one; return the result.
 
     Args:
-        account: Whose deployment.
+        account: Of the deployment.
         settings: Of the platform.
         tell: Called with each line of progress.
         sleep: Waits between two looks; it may raise KeyboardInterrupt, and AWS then goes on by itself.
@@ -257,7 +261,7 @@ def _follow_refresh(
     tell: Callable[[str], None],
     sleep: Callable[[float], None],
 ) -> Upgraded:
-    """Tell the progress until the refresh *identity* has ended; a failed launch takes it back at once."""
+    """Report the progress until the refresh *identity* has ended; roll back at once when a launch fails."""
     names = ResourceNames(settings.cloud.name)
     last_line, cause = "", ""
     console: tuple[str, ...] = ()
@@ -305,7 +309,7 @@ def _read_failed_launch(account: Account, names: ResourceNames, begun: datetime)
 
 
 def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the last lines that the machine of *activity* wrote to its console, none if AWS has them not."""
+    """Return the last console lines of the machine of *activity*; none if AWS does not have them."""
     words = [word.strip(".,") for word in str(activity["Description"]).split()]
     instance = next((word for word in words if word.startswith("i-")), "")
     if not instance:
@@ -316,7 +320,7 @@ def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, .
         return ()  # the machine is gone, or this type of machine has no console
     lines = [line.strip() for line in str(output.get("Output", "")).splitlines() if line.strip()]
     ours = [line for line in lines if "rse-pf" in line]
-    return tuple((ours or lines)[-_LINES:])
+    return tuple((ours or lines)[-_CONSOLE_LINES:])
 
 
 def _record_version(

@@ -1,4 +1,4 @@
-"""Run what builds and deploys: `scripts/assets.py`, and the pinned command line of the CDK by scripts/cdk.sh.
+"""Build and deploy: run `scripts/assets.py`, and the pinned command line of the CDK by `scripts/cdk.sh`.
 
 Both belong to a checkout, not to the installed package.
 """
@@ -28,7 +28,7 @@ def are_packages_built(checkout: Path) -> bool:
 class CdkTools:
     """The tools of the checkout in the folder *checkout*; their output goes to the terminal.
 
-    *settings_file* is where the settings come from, None for the checkout's cdk.json.
+    *settings_file* holds the settings; None means the checkout's cdk.json.
     """
 
     def __init__(

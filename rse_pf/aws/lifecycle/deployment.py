@@ -1,4 +1,4 @@
-"""Read what stands of a deployment: its stacks, its groups of servers, and whether it is parked.
+"""Read the state of a deployment: its stacks, its groups of servers, and whether it is parked.
 
 Nothing is changed.
 """
@@ -30,7 +30,7 @@ class GroupSize(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParkNote(msgspec.Struct, frozen=True, kw_only=True):
-    """What a parked deployment was before; it is kept in the SSM parameter ``parked``."""
+    """The sizes of a parked deployment before parking; kept in the SSM parameter ``parked``."""
 
     groups: dict[str, GroupSize]
     """By name."""
@@ -44,7 +44,7 @@ class ParkNote(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Deployment:
-    """What stands: status by box of each stack that exists, groups by name, and the note if it is parked."""
+    """Status of each existing stack by box, groups by name, and the note of a parked deployment."""
 
     stacks: Mapping[str, str] = field(default_factory=dict)
     groups: Mapping[str, GroupSize] = field(default_factory=dict)
@@ -64,7 +64,7 @@ class Deployment:
 
 
 def read_deployment(account: Account, settings: PlatformSettings) -> Deployment:
-    """Return what stands of the deployment ``cloud.name``.
+    """Return the state of the deployment ``cloud.name``.
 
     Raises:
         ConfigurationError: AWS refused.
@@ -101,7 +101,7 @@ def read_note(account: Account, names: ResourceNames) -> ParkNote | None:
         return msgspec.json.decode(parameter["Parameter"]["Value"], type=ParkNote)
     except msgspec.DecodeError as error:
         raise ConfigurationError(
-            f"the SSM parameter {names.parked} does not say what was parked: {error}",
+            f"the SSM parameter {names.parked} cannot be read: {error}",
             hint=f"delete it: aws ssm delete-parameter --name {names.parked}; then rse-pf cloud up",
         ) from error
 

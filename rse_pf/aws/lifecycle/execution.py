@@ -32,16 +32,19 @@ from rse_pf.scaling.health import DRAIN_S, GRACE_S
 
 __all__ = ["StepContext", "carry_out"]
 
+# Time between two reads of a state, in seconds.
 _POLL_S = 5.0
+# Time limit of a change of a stack, in seconds: the load balancer and endpoints take up to half an hour.
 _STACK_S = 2400.0
+# Time limit until all servers have ended, in seconds, in addition to `DRAIN_S`.
 _EMPTY_S = 600.0
-"""Beside `DRAIN_S`."""
+# Time limit until all wanted servers are healthy, in seconds, in addition to `GRACE_S`.
 _HEALTHY_S = 600.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepContext:
-    """What the steps act on."""
+    """The account, settings, tools and clocks that steps use; ``tell`` reports a line of progress."""
 
     account: Account
     settings: PlatformSettings
@@ -58,7 +61,7 @@ class StepContext:
 
 
 def carry_out(steps: Iterable[Step], world: StepContext) -> None:
-    """Carry out *steps* in order, and tell each before it begins.
+    """Carry out *steps* in order, and report each before it begins.
 
     Raises:
         DeploymentFailed: A stack could not be deployed or destroyed, or servers did not become healthy or
@@ -125,7 +128,7 @@ def _read_failure_reason(account: Account, stack: str) -> str:
 
 
 def _write_park_note(step: Step, world: StepContext) -> None:
-    """Write the sizes down before they are changed; sizes that were noted before are kept."""
+    """Note the sizes of the groups before they are changed; an existing note keeps its sizes."""
     note = read_note(world.account, world.names)
     groups = note.groups if note is not None else read_sizes(world.account, world.names)
     since = note.since if note is not None else world.now().isoformat(timespec="seconds")

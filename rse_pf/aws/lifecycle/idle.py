@@ -2,7 +2,7 @@
 
 The function runs in AWS Lambda: each hour where ``cloud.idle_action`` says so, and at the entries of
 ``scaling.schedule``.  It may read metrics, and end and start the servers of its own groups.  It can delete
-nothing but the note that the deployment is parked, so that a mistake costs a ``rse-pf cloud resume``.
+nothing but the note that the deployment is parked, so ``rse-pf cloud resume`` undoes its mistakes.
 """
 
 from __future__ import annotations

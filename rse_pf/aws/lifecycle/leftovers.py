@@ -1,4 +1,4 @@
-"""Find what is still in an account after `cdk destroy`: what was kept on purpose, and what was forgotten.
+"""Find resources that remain after the stacks are destroyed: kept on purpose, or forgotten.
 
 Resources of the platform have the tag ``rse-pf`` or a name with one of our prefixes; what an existing stack
 owns is not left over.  Nothing is deleted; each leftover names the command that deletes it.
@@ -70,7 +70,7 @@ def _list_resources(
         try:
             is_ours = _is_tagged(account, of, row["Name"])
         except ConfigurationError as error:
-            unread[row["Name"]] = f"perhaps not ours, it cannot be looked into: {error.message}"
+            unread[row["Name"]] = f"perhaps not ours, it cannot be read: {error.message}"
             is_ours = True
         if is_ours:
             yield "bucket", row["Name"], ""
@@ -86,8 +86,8 @@ def _list_resources(
         "cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=of.alarm_prefix
     ):
         yield "alarm", row["AlarmName"], row["AlarmArn"]
-    free: list[dict[str, Any]] = [{"Name": f"tag:{DEPLOYMENT_TAG}", "Values": [of.prefix]}]
-    unattached = [*free, {"Name": "status", "Values": ["available"]}]
+    tagged: list[dict[str, Any]] = [{"Name": f"tag:{DEPLOYMENT_TAG}", "Values": [of.prefix]}]
+    unattached = [*tagged, {"Name": "status", "Values": ["available"]}]
     for row in account.pages("ec2", "describe_volumes", "Volumes", Filters=unattached):
         yield "volume", row["VolumeId"], ""
     for row in account.pages("ec2", "describe_network_interfaces", "NetworkInterfaces", Filters=unattached):

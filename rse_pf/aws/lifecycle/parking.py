@@ -1,4 +1,4 @@
-"""End all servers of a deployment, note what is needed to bring them back, and bring them back.
+"""End all servers of a deployment, note the sizes of its groups, and restore them.
 
 An operator's commands, the idle timer and the schedule use the same calls; the role of the function allows no
 others.
@@ -25,11 +25,12 @@ __all__ = [
 _SUSPENDED = ("AlarmNotification", "ScheduledActions")
 """Processes of a parked group: neither an alarm nor a scheduled action starts a server."""
 
+# Alarms of one call that switches their actions: the most that AWS takes.
 _ALARMS_OF_A_CALL = 100
 
 
 def write_note(account: Account, names: ResourceNames, note: ParkNote) -> None:
-    """Write *note* over the one that is there; raises ConfigurationError."""
+    """Write *note*, in place of an existing one; raises ConfigurationError."""
     value = msgspec.json.encode(note).decode()
     account.change("ssm", "put_parameter", Name=names.parked, Value=value, Type="String", Overwrite=True)
 
@@ -40,19 +41,19 @@ def delete_note(account: Account, names: ResourceNames) -> None:
 
 
 def silence_alarms(account: Account, names: ResourceNames) -> None:
-    """Let no alarm of the deployment act or notify; raises as `Account.find`."""
+    """Disable the actions and notifications of all alarms of the deployment; raises as `Account.find`."""
     for some in _alarms_of_deployment(account, names):
         account.change("cloudwatch", "disable_alarm_actions", AlarmNames=some)
 
 
 def enable_alarms(account: Account, names: ResourceNames) -> None:
-    """Let the alarms of the deployment act and notify again; raises as `Account.find`."""
+    """Enable the actions and notifications of all alarms of the deployment; raises as `Account.find`."""
     for some in _alarms_of_deployment(account, names):
         account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
 
 
 def empty_group(account: Account, group: str) -> None:
-    """Suspend what starts servers in *group*, and end all of its servers; raises as `Account.find`."""
+    """Suspend the processes that start servers in *group*, and end its servers; raises as `Account.find`."""
     account.change(
         "autoscaling", "suspend_processes", AutoScalingGroupName=group, ScalingProcesses=list(_SUSPENDED)
     )

@@ -1,7 +1,6 @@
 """Decide by which steps a deployment is put up, parked, resumed or taken down.
 
-The plan depends on what stands and on nothing else; a step that was done before does no harm when it is
-repeated.
+The plan depends only on the resources that exist; a step that was done before may be repeated.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from rse_pf.errors import ConfigurationError
 __all__ = ["KEPT", "Action", "Step", "plan_down", "plan_park", "plan_resume", "plan_up", "size_to_restore"]
 
 KEPT = "Data"
-"""The stack that `plan_down` keeps unless the data is to go, too: maps, logs and the signing key."""
+"""The stack that `plan_down` keeps unless the data is deleted, too: maps, logs and the signing key."""
 
 Action = Literal[
     "build", "bootstrap", "settle", "deploy", "destroy", "note", "silence", "empty", "await-empty",
@@ -53,7 +52,7 @@ class Step:
     deep: bool = False
 
     def __str__(self) -> str:
-        """Return what the step does, as one line."""
+        """Return a description of the step in one line."""
         return _TEXTS[self.action].format(self.box)
 
 
@@ -74,11 +73,10 @@ def plan_park(deployment: Deployment, *, deep: bool) -> list[Step]:
     """Return the steps that end all servers and, if *deep*, everything but the data.
 
     Raises:
-        ConfigurationError: Nothing stands that could be parked.
+        ConfigurationError: There is no deployment.
     """
-    stands = [box for box in STACKS if box in deployment.stacks and box != KEPT]
     note = deployment.note
-    if note is None and "Backend" not in stands:
+    if note is None and "Backend" not in deployment.stacks:
         raise ConfigurationError("there is no platform to park", hint="put it up: rse-pf cloud up")
     steps = [] if note is not None and (note.deep or not deep) else [Step("note", deep=deep)]
     if deployment.groups:

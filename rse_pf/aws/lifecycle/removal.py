@@ -1,4 +1,4 @@
-"""Delete what outlives the stacks: forgotten resources, and with the operator's consent the data.
+"""Delete resources that outlive the stacks: forgotten ones and, if the operator agrees, the data.
 
 Object lock is respected: an audit log that is still locked stays, and so does its bucket.  AWS can restore a
 secret for 30 days after its deletion.
@@ -17,11 +17,12 @@ from rse_pf.errors import ConfigurationError
 
 __all__ = ["erase_data", "sweep"]
 
+# Objects of one call that deletes: the most that S3 takes.
 _OBJECTS_OF_A_CALL = 1000
 
 
 def sweep(account: Account, names: ResourceNames) -> None:
-    """Delete what no stack owns and nobody keeps on purpose; raises as `Account.find`."""
+    """Delete the resources that no stack owns and that are not kept on purpose; raises as `Account.find`."""
     for leftover in find_leftovers(account, names):
         if leftover.kind in _SWEPT and not leftover.unread:
             service, method, argument = _SWEPT[leftover.kind]
@@ -69,7 +70,7 @@ def _deletion_order(leftover: Leftover) -> tuple[bool, str]:
 def _empty_bucket(account: Account, bucket: str, audit_days: int, *, has_lock: bool) -> tuple[int, datetime]:
     """Delete every version of every object; return how many are locked, and until when the last one is.
 
-    S3 answers for a locked object as for one that the account may not delete: only *has_lock* tells which.
+    S3 answers alike for a locked object and for one that the account may not delete; *has_lock* decides.
     """
     locked, until = 0, datetime.min
     for page in _pages_of_versions(account, bucket):

@@ -1,6 +1,6 @@
-"""What AWS keeps: objects in S3, signing keys, archived audit logs.
+"""Persistent data on AWS: objects in S3, signing keys, archived audit logs.
 
-Everything that must survive a server belongs here; instances belong to `fleet`.
+Servers and their agents belong to `fleet`.
 """
 
 from rse_pf.aws.storage.s3_store import S3Store, open_bucket, open_data_store

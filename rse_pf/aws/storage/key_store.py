@@ -1,6 +1,6 @@
 """The signing keys of a cloud: private keys in one secret, public keys as a JWKS in the artifact bucket.
 
-Two keys overlap in a rotation: servers learn the new one before anything is signed with it, and the old one
+Two keys overlap in a rotation: servers fetch the new one before anything is signed with it, and the old one
 stays until its last token has expired.  No private key is in an error message or a log line, and a public key
 is published only after its private key is stored.  `rse-pf token --cloud` reads the secret; servers never do.
 """
@@ -36,7 +36,7 @@ class KeyRing:
 
     @classmethod
     def from_json(cls, text: str) -> KeyRing | None:
-        """Return the ring that `to_json` wrote; None for what CloudFormation put there at first."""
+        """Return the ring that `to_json` wrote; None for the initial value of CloudFormation."""
         try:
             document = json.loads(text)
             rows = document["keys"]
@@ -66,7 +66,7 @@ class KeyRing:
         return may[-1] if may else self.keys[0][0]
 
     def rotated(self, key: SigningKey, *, now: float, settings: PlatformSettings) -> KeyRing:
-        """Return the newest key and *key*, which signs once every server knows it.
+        """Return the newest key and *key*, which signs when every server has fetched it.
 
         Raises:
             ConfigurationError: The previous rotation is not over yet.
@@ -84,7 +84,7 @@ class KeyRing:
         """Return a ring of the newest key only, which signs from *now* on; servers stop trusting the others.
 
         Raises:
-            ConfigurationError: There is no other key; or not every server knows the newest key yet, so that
+            ConfigurationError: There is no other key; or servers may still lack the newest key, so that
                 robots with valid tokens would be refused, and *force* is false.
         """
         if len(self.keys) == 1:
@@ -95,7 +95,7 @@ class KeyRing:
         key, from_s = self.keys[-1]
         if now < from_s and not force:
             raise ConfigurationError(
-                f"for {from_s - now:.0f} s more servers may not know key {key.key_id} and refuse robots",
+                f"servers may lack key {key.key_id} and refuse robots for {from_s - now:.0f} s more",
                 hint="wait; if the previous key was stolen, add --force",
             )
         return KeyRing(keys=((key, min(from_s, now)),))
@@ -140,7 +140,7 @@ class KeyStore:
         self.publish(ring)
 
     def access_control_store(self) -> AccessControlStore:
-        """Return the roster and the deny list beside the public keys, which agents fetch repeatedly."""
+        """Return the roster and the deny list in the bucket of the public keys; agents fetch both."""
         return AccessControlStore(self._bucket)
 
     def published(self) -> KeySet:

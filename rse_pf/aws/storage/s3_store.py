@@ -20,9 +20,12 @@ from rse_pf.storage.object_store import ObjectInfo, ObjectStore, Usage, check_na
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
 
-_NOT_FOUND, _PRECONDITION_FAILED, _RANGE_OUTSIDE = 404, 412, 416
+# HTTP statuses of S3.
+_NOT_FOUND = 404
+_PRECONDITION_FAILED = 412
+_RANGE_OUTSIDE = 416
+# Size of the parts of a large object: S3 takes 5 MiB or more, and one part is held in memory.
 _PART_BYTES = 8 << 20
-"""Of a large object; S3 takes parts of 5 MiB or more."""
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
 _ARCHIVED = "InvalidObjectState"
 _RENEW = "renew the AWS credentials of this machine: sign in again, or give it a role"
@@ -40,7 +43,7 @@ _REFUSED = {
         _RENEW,
     ),
 }
-"""Code of S3 to the action that helps; for every other code: the policies."""
+"""Error code of S3 to the hint; every other code gets a hint at the policies."""
 
 
 def open_bucket(bucket: str, region: str) -> S3Store:
@@ -128,7 +131,7 @@ class S3Store:
                     yield ObjectInfo(name=check_name(row["Key"]), size=int(row["Size"]))
 
     def folders(self, prefix: str) -> Iterator[str]:
-        """Yield what stands between *prefix* and the next slash in names, sorted."""
+        """Yield the parts of names between *prefix* and the next slash, sorted."""
         for page in self._pages(prefix, Delimiter="/"):
             for row in page.get("CommonPrefixes", ()):
                 yield str(row["Prefix"])[len(prefix) : -1]

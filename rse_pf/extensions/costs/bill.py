@@ -20,6 +20,7 @@ from rse_pf.config.cloud_layout import (
     ENDPOINT_SERVICES,
     LAMBDA_MEMORY_MB,
     ON_DEMAND_SERVERS,
+    VOLUME_GB,
     zone_count,
 )
 from rse_pf.config.front_door import rate_rules
@@ -45,12 +46,10 @@ __all__ = [
 # Hours of a month, as in the calculator of AWS.
 HOURS = 730.0
 DAY_H = 24.0
-# Size of the volume of a server.
-VOLUME_GB = 8
 NOT_INCLUDED = (
-    "taxes, data out to the robots (the same for fleet and Lambda), what the firewall inspects beside burst "
-    "commands, requests to S3, stored maps and logs, copies in "
-    "other regions, live maps (0.04 USD an hour each, in S3), savings plans, the free tier"
+    "taxes, data out to the robots (the same for fleet and Lambda), inspection by the firewall "
+    "(except of burst commands), requests to S3, stored maps and logs, copies in other regions, "
+    "live maps (0.04 USD an hour each, in S3), savings plans, the free tier"
 )
 
 _HOUR_S = 3600.0
@@ -63,7 +62,7 @@ _BALANCER_ZONES = 2
 _DETAILED_METRICS = 7
 # Metrics that the agent of a server with robots reads each period: the numbers of robots and of servers.
 _READ_METRICS = 2
-# The web ACL has one rule beside the rates: it refuses burst commands without a token.
+# Rules of the web ACL in addition to the rate limits: one refuses burst commands without a token.
 _TOKEN_RULES = 1
 # An alarm with a shorter period than this is priced higher.
 _FAST_BELOW_S = 60
@@ -71,14 +70,14 @@ _FAST_BELOW_S = 60
 _CANARY_S = 1.0
 
 Needs = Literal["servers", "balancer", "always"]
-"""What a line is paid for: running servers, the load balancer with firewall and endpoints, or anyway."""
+"""The resources whose removal ends the costs of a line; ``always`` lines stay while parked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Load:
     """How many robots send how many commands, and for how long each day.
 
-    ``burst_commands_per_day`` are answered by the Lambda beside the fleet.
+    ``burst_commands_per_day`` are answered by the Lambda in addition to the fleet.
     """
 
     robots: int = 0
@@ -208,7 +207,7 @@ def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> lis
 
 
 def _balancer_lines(settings: PlatformSettings, prices: Prices, load: Load) -> list[CostLine]:
-    """Return what stands in front of the servers, and the endpoints of their network."""
+    """Return the lines of load balancer, firewall, and interface endpoints."""
     # AWS counts connections or bytes, whichever costs more; a robot connects once.
     by_connections = load.robots / _CONNECTIONS_OF_A_UNIT
     by_bytes = load.commands_per_s * _HOUR_S * prices.command_bytes / _BYTES_OF_A_UNIT

@@ -94,7 +94,7 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if price is None:
             raise ConfigurationError(
                 f"no price of {instance_type} is known; the table has {', '.join(sorted(self.servers))}",
-                hint=f"add it to servers in {PRICES_FILE} beside cdk.json: vcpus, per_hour, spot_per_hour",
+                hint=f"add it to servers in {PRICES_FILE} next to cdk.json: vcpus, per_hour, spot_per_hour",
             )
         return price
 
@@ -107,7 +107,7 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if self.region != region:
             lines.append(f"WRONG REGION: these prices are for {self.region}, and cloud.region is {region}")
         if lines:
-            lines.append(f"write the prices of your region into {PRICES_FILE} beside cdk.json")
+            lines.append(f"write the prices of your region into {PRICES_FILE} next to cdk.json")
         return lines
 
 

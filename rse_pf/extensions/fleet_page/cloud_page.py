@@ -7,11 +7,11 @@ from datetime import datetime, timezone
 from typing import Any
 
 from rse_pf.aws.account import Account
-from rse_pf.extensions.fleet_page.feeds.cloud_overview import read_overview
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.extensions.fleet_page.app import PageActions
 from rse_pf.extensions.fleet_page.feeds.cloud_feed import CloudFeed
+from rse_pf.extensions.fleet_page.feeds.cloud_overview import read_overview
 from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.extensions.fleet_page.server import listen, serve_page
 

@@ -1,7 +1,7 @@
 """The configuration of Envoy: one listener, two clusters, and endpoint files, the only part that changes.
 
-Every value that differs from Envoy's default has its reason beside it; most were found by measuring what
-robots notice when servers start, drain, stall and crash.
+Every value that differs from Envoy's default has its reason in a comment; most were found by measuring robots
+while servers start, drain, stall and crash.
 """
 
 from __future__ import annotations
@@ -40,16 +40,17 @@ LOOPBACK_LISTENER = "loopback"
 _DATA_READY = "/data/readyz"
 _TYPES = "type.googleapis.com/envoy"
 _LOOPBACK = "127.0.0.1"
+# Limit of Envoy's circuit breakers, which must not act before a server's own limit ``serving.max_robots``.
 _NO_LIMIT = 1_000_000
-"""A server counts its robots itself (``serving.max_robots``); Envoy's breakers must not act before."""
+# Headers of one request: robots send about ten.
 _MAX_HEADERS = 64
 _CIPHERS = (
     "ECDHE-ECDSA-AES128-GCM-SHA256", "ECDHE-RSA-AES128-GCM-SHA256", "ECDHE-ECDSA-AES256-GCM-SHA384",
     "ECDHE-RSA-AES256-GCM-SHA384", "ECDHE-ECDSA-CHACHA20-POLY1305", "ECDHE-RSA-CHACHA20-POLY1305",
 )  # fmt: skip
 """Of TLS 1.2: those that authenticate what they encrypt, with forward secrecy.  TLS 1.3 has no others."""
+# Connections of robots and other clients; more are closed.  10,000 robots and their data requests fit.
 _MAX_CONNECTIONS = 12_000
-"""Of robots and others; more are closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,13 +130,13 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "@type": f"{_TYPES}.extensions.filters.network.http_connection_manager.v3.HttpConnectionManager",
         "stat_prefix": "robots",
         "codec_type": "HTTP1",
-        # An open WebSocket is one endless request: no clock may end it but the robot's and the server's.
+        # An open WebSocket is one endless request: only the robot and the server may end it.
         "stream_idle_timeout": "0s",
         "request_timeout": "0s",
         "common_http_protocol_options": {
             # For connections without a request; an open WebSocket is a request.
             "idle_timeout": _seconds(settings.session.hello_timeout_s),
-            # Else a client without a token keeps its place by requests for nothing.  After this time a
+            # Otherwise a client without a token keeps its connection by useless requests.  After this time a
             # connection closes with its next reply; what is open then, also a WebSocket, is not cut.
             "max_connection_duration": _seconds(settings.session.hello_timeout_s),
             "max_headers_count": _MAX_HEADERS,
@@ -147,9 +148,9 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "delayed_close_timeout": "0s",
         "request_headers_timeout": _seconds(settings.session.hello_timeout_s),
         "max_request_headers_kb": MAX_HANDSHAKE_BYTES // 1024,
-        # Whatever a robot says of its own address is dropped; servers read what stands here instead.
+        # Envoy replaces the address that a robot claims by the address of its connection.
         "use_remote_address": True,
-        # Strangers need to know neither the software nor how long a server took.
+        # Unauthenticated clients learn neither the software nor the time that a server took.
         "server_header_transformation": "PASS_THROUGH",
         "xff_num_trusted_hops": 0,
         "normalize_path": True,
@@ -172,7 +173,7 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "address": _address(settings.serving.host if lan is None else lan.address, port),
         # With the default a second Envoy would share a taken port in silence.
         "enable_reuse_port": False,
-        # Robots that are connected wait for no burst of new connections.
+        # A burst of new connections does not delay connected robots.
         "max_connections_to_accept_per_socket_event": 1,
         # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
         "per_connection_buffer_limit_bytes": WRITE_BUFFER_BYTES,
@@ -271,7 +272,7 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
     route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
     rosbridge = [{"match": {"path": ROSBRIDGE_PATH}, "route": {**route, "cluster": ROSBRIDGE_CLUSTER}}]
     # A large upload has no time limit while bytes flow; the data server is stricter.
-    # No retries: the robot knows whether a part arrived, and resumes there.
+    # No retries: the robot resumes at the part that is missing.
     idle = _seconds(3 * BODY_TIMEOUT_S)
     data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
     timeout = _seconds(settings.session.hello_timeout_s)

@@ -43,7 +43,7 @@ _LOOK_AGAIN_S = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetStats:
-    """What Envoy knows of one target."""
+    """One target as Envoy reports it."""
 
     healthy: bool
     robots: int
@@ -130,7 +130,7 @@ class EnvoyLoadBalancer:
         self.process.start(command, dies_with_parent=self._dies_with_parent)
 
     def adopt(self, mark: ProcessMark | None, *, port: int) -> None:
-        """Know the balancer of an earlier control plane, which may be gone; its port stays its port."""
+        """Take over the balancer of an earlier control plane, which may have ended, with its port."""
         self.process.mark, self.port = mark, port
 
     async def wait_live(self, timeout_s: float) -> None:

@@ -41,20 +41,24 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["ControlOptions", "ControlPlane"]
 
+# Replacements within a minute of servers that ended soon after their start; further ones wait.
 MAX_RESTARTS_PER_MINUTE = 5
-"""Servers that failed soon after their start and are replaced within a minute; then the others wait."""
-_ASK_S = 2.0
+# Time limit of a request to move robots, in seconds.
+_MOVE_TIMEOUT_S = 2.0
+# Time limit of reading a server's status, as a share of the time between two samples.
 _STATUS_SHARE = 0.5
+# A check that ends later than its time limit by this share of it was delayed by the control plane itself.
 _LATE_SHARE = 0.5
-"""A check that ends later than its deadline by this share of it was delayed by the control plane itself."""
 _LEAVING = frozenset({"draining", "leaving"})
+# Longest pause between two attempts to start the balancer, in seconds.
 _MAX_PAUSE_S = 8.0
+# Time between two checks whether a standby is missing, in seconds.
 _STANDBY_EVERY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlOptions:
-    """What a control plane does by itself.
+    """The automatic actions of a control plane.
 
     With ``elastic``, monitor and scale modifier run, and what breaks is replaced; with ``rebalance``, too,
     robots of crowded servers are asked to move.  ``compress`` is the factor by which periods, idle time,
@@ -113,7 +117,7 @@ class ControlPlane:
         """Check the health of every server from its announcement on."""
         if self._is_idle:
             return
-        self._fleet.on_ready = lambda member: self._fleet.keep(self._check_on(member))
+        self._fleet.on_ready = lambda member: self._fleet.keep(self._check_periodically(member))
 
     def start(self) -> None:
         """Start the monitor, and the scale modifier if elastic."""
@@ -156,8 +160,8 @@ class ControlPlane:
 
     # --- health ----------------------------------------------------------------------------------
 
-    async def _check_on(self, member: Member) -> None:
-        """Ask one server for */readyz* periodically, as the balancer does."""
+    async def _check_periodically(self, member: Member) -> None:
+        """Check */readyz* of one server periodically, as the balancer does."""
         assert member.server is not None
         port = self._fleet.control(member.server)
         try:
@@ -165,14 +169,14 @@ class ControlPlane:
                 began_s = time.monotonic()
                 ok = await self._check(member, port, began_s)
                 if ok is not None:
-                    self._judge(member, ok)
+                    self._note_check(member, ok)
                 left_s = began_s + LOCAL_INTERVAL_S - time.monotonic()
                 await asyncio.sleep(max(left_s, 0.0))
         finally:
             port.close()
 
     async def _check(self, member: Member, port: ControlPort, began_s: float) -> bool | None:
-        """Return the outcome of one check; None if it tells nothing about the server."""
+        """Return the outcome of one check; None if it does not count for the server."""
         try:
             reply = await port.ask(READY_PATH, timeout_s=LOCAL_TIMEOUT_S)
         except ConnectionError:
@@ -183,8 +187,8 @@ class ControlPlane:
             return None
         return reply.status == 200
 
-    def _judge(self, member: Member, ok: bool) -> None:
-        """Count *ok*; the clock is compressed, too, so that the grace period is shorter."""
+    def _note_check(self, member: Member, ok: bool) -> None:
+        """Update the health of *member*; its clock is compressed, too, which shortens the grace period."""
         health = member.health
         now_s = time.monotonic() * self._compress
         member.health = observe(health, ok, self.settings.health, now_s=now_s)
@@ -234,7 +238,7 @@ class ControlPlane:
         if server is not None:
             if member.name not in self._ports:
                 self._ports[member.name] = self._fleet.control(server)
-            # A server that does not answer has no numbers; `_check_on` judges its health.
+            # A server that does not answer has no numbers; `_check_periodically` decides about its health.
             with contextlib.suppress(ConnectionError):
                 timeout_s = _STATUS_SHARE * self._every_s
                 reply = await self._ports[member.name].ask("/status", timeout_s=timeout_s)
@@ -282,7 +286,8 @@ class ControlPlane:
         if member is None or member.server is None:
             return
         target = f"/move?robots={request.robots}&spread_s={request.spread_s:g}"
-        reply = await self._fleet.control(member.server).ask_once(target, timeout_s=_ASK_S, method="POST")
+        port = self._fleet.control(member.server)
+        reply = await port.ask_once(target, timeout_s=_MOVE_TIMEOUT_S, method="POST")
         if reply is None or reply.status >= 300:
             return  # the next sample asks again
         answer = reply.document()

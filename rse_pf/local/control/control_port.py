@@ -2,8 +2,8 @@
 
 ``GET /status`` is JSON, ``GET /metrics`` is for Prometheus; ``POST /drain?server=NAME`` and ``POST /roll``
 are answered with the events of the operation, one JSON object a line, until it is over; ``GET /watch`` with
-what happens, in the same form, until the connection ends.  Every request needs the token of the control
-ports, and none may come from a web page.  A slow or malformed request ends its own connection only.
+all events and states, in the same form, until the connection ends.  Every request needs the token of the
+control ports, and none may come from a web page.  A slow or malformed request ends its own connection only.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ async def serve_control_port(
     """Listen on loopback; *pages* are asked with GET, *operations* with POST, by their paths.
 
     Args:
-        pages: What is shown.
-        operations: What is done.
+        pages: By path; requested with GET.
+        operations: By path; requested with POST.
         token: That every request must carry.
-        streams: What is told for as long as somebody listens; asked with GET.
+        streams: Streams of events until the connection ends; requested with GET.
         port: 0 takes a free one.
         first_request_s: A connection whose request is not complete by then is cut.
 

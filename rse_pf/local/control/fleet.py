@@ -1,8 +1,8 @@
 """The servers of one local platform in operation, each from its launch until its process is gone.
 
-The fleet knows which servers may get robots, emits every change as an event, and carries out what others
-decide: launch, drain, replace.  A server that is to drain is removed from the balancer's targets before it is
-asked to, and a name is never used twice.
+The fleet decides which servers may get robots, emits every change as an event, and carries out launches,
+drains and replacements that others decide.  A server that is to drain is removed from the balancer's targets
+before it is asked to, and a name is never used twice.
 """
 
 from __future__ import annotations
@@ -28,21 +28,27 @@ from rse_pf.scaling.health import Health, time_to_notice_s
 
 __all__ = ["Fleet", "FleetReports", "Member", "ServerHealth"]
 
-_ASK_S = 2.0
+# Time limit of a request to drain, in seconds.
+_DRAIN_REQUEST_S = 2.0
+# Longest wait for the balancer's answer before the state of the server is read again, in seconds.
 _LOOK_UP_S = 0.5
+# Pause between two such waits, in seconds.
 _PAUSE_S = 0.02
+# Time after which tasks that did not end are cancelled again, in seconds.
 _CANCEL_AGAIN_S = 0.2
+# A standby starts when no server became healthy for this long, in seconds, so that it delays no start.
 _CALM_S = 3.0
 _PREFIX = "server-"
+# A server that ends sooner after it became healthy, in seconds, counts in `MAX_RESTARTS_PER_MINUTE`.
 _MIN_UPTIME_S = 10.0
-"""A server that ends sooner after it became healthy counts against the control plane's
-`MAX_RESTARTS_PER_MINUTE`."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Member:
-    """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed; ``on_trial``: it is the
-    first of a release, and is not replaced until it was healthy.
+    """One server.
+
+    ``leaving``: it drains; ``out``: it was replaced and is killed; ``on_trial``: it was started by a roll,
+    and is not replaced until it was healthy.
 
     Times are monotonic seconds; those of ``health`` are compressed with the rest.
     """
@@ -74,12 +80,11 @@ class Member:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerHealth:
-    """The servers as they stand.
+    """Numbers and names of servers by state.
 
-    ``servers`` counts all that are or should be there: those that start, serve, failed or died, but not
-    those that drain.  ``broken`` run but failed their checks; ``dead`` ended unasked, each with whether that
-    was soon after its start.
-    ``replacing`` are replacements of broken ones that do not serve yet.
+    ``servers`` counts all that exist or should: those that start, serve, fail their checks or ended
+    unexpectedly, but not those that drain.  ``broken`` run but fail their checks; ``dead`` ended unexpectedly, each
+    with whether it ended soon after its start.  ``replacing`` counts replacements that do not serve yet.
     """
 
     servers: int
@@ -92,7 +97,7 @@ class ServerHealth:
 
 @dataclass(frozen=True, slots=True)
 class FleetReports:
-    """How others hear of the servers: *emit* takes an event with details, *changed* has the state written."""
+    """Callbacks: *emit* takes an event with details, *changed* writes the state file."""
 
     emit: Callable[..., None]
     changed: Callable[[], None]
@@ -123,7 +128,7 @@ class Fleet:
         self._emit = reports.emit
         self._changed = reports.changed
         self.is_full: Callable[[], bool] = lambda: False
-        """While the disk is full, no server is to be launched: it could not announce itself."""
+        """Return whether the disk is full; no server is launched then, since it could not announce itself."""
         self._tasks: set[asyncio.Task[Any]] = set()
         self._still_targets: set[str] = set()
         self.on_ready: Callable[[Member], None] = lambda member: None
@@ -177,11 +182,10 @@ class Fleet:
         return member
 
     def adopt(self, name: str, *, now_s: float, is_target: bool) -> Member:
-        """Take over a server of an earlier control plane, known to `LocalBackendServers`; `bring_up` must
-        follow.
+        """Take over a server of an earlier control plane; `bring_up` must follow.
 
-        It is judged by its health checks at once, without the grace of a new one.  The balancer's targets
-        stay as they are until every server that *is_target* is known again.
+        Its health checks count at once, without the grace period of a new server.  The targets of the
+        balancer stay unchanged until every server that *is_target* has been adopted.
         """
         number = name.removeprefix(_PREFIX)
         self.launched = max(self.launched, int(number) if number.isdigit() else 0)
@@ -325,7 +329,8 @@ class Fleet:
         server = member.server
         reply = None
         if server is not None:
-            reply = await self.control(server).ask_once("/drain?wait=0", timeout_s=_ASK_S, method="POST")
+            port = self.control(server)
+            reply = await port.ask_once("/drain?wait=0", timeout_s=_DRAIN_REQUEST_S, method="POST")
         accepted = reply is not None and reply.status == 202
         drain_s = MOVE_WITHIN_MS / 1e3 + session.answer_timeout_s + STOP_TIMEOUT_S
         clean = True
@@ -348,7 +353,7 @@ class Fleet:
         An adopted server is not: the earlier control plane that asked it wanted one server less.
         """
         if not member.leaving:
-            self.begin_drain(member, "the server was told to leave")
+            self.begin_drain(member, "the server drains on another request")
             if not member.adopted:
                 self.dead[member.name] = False
                 self.on_lost()
@@ -418,9 +423,9 @@ class Fleet:
     def _note_lost(self, member: Member) -> None:
         if member.on_trial:
             return
-        young_since_s = time.monotonic() - _MIN_UPTIME_S
-        is_young = member.healthy_s is None or member.healthy_s > young_since_s
-        self.dead[member.name] = is_young and not self.is_full()  # a full disk is no crash loop
+        early_since_s = time.monotonic() - _MIN_UPTIME_S
+        ended_early = member.healthy_s is None or member.healthy_s > early_since_s
+        self.dead[member.name] = ended_early and not self.is_full()  # a full disk is no crash loop
         self.on_lost()
 
     def _set_targets(self) -> None:

@@ -1,7 +1,7 @@
-"""What an operator may ask of a running control plane: drain one server, or replace all, one by one.
+"""Operations of a control plane that an operator requests: drain a server, or replace all, one by one.
 
-An operation goes on when the command that asked for it is gone.  Only one runs at a time: two would take
-servers from each other.
+An operation continues when the command that requested it has ended.  Only one runs at a time: two would drain
+each other's servers.
 """
 
 from __future__ import annotations
@@ -18,17 +18,22 @@ from rse_pf.errors import RsePfError, UsageError
 __all__ = ["FAILED", "OVER", "Operations"]
 
 Event = Mapping[str, Any]
-OVER, FAILED = "operation-over", "operation-failed"
-"""The last event of an operation."""
+# Last event of an operation that succeeded.
+OVER = "operation-over"
+# Last event of an operation that failed.
+FAILED = "operation-failed"
+# Connections that may watch at the same time: a few pages and commands of one operator.
 _MAX_WATCHERS = 8
-_MAX_UNHEARD = 1000
-"""Events that wait for a slow watcher; newer ones are left out then, and it can tell by their numbers."""
-_LOOK_S, _AFTER_S = 1.0, 0.15
-"""A state is told once a second, soon after the monitor took its sample at the full second."""
+# Events that wait for a slow watcher; newer ones are dropped, which their numbers show.
+_MAX_WAITING_EVENTS = 1000
+# Time between two states, in seconds.
+_STATE_PERIOD_S = 1.0
+# Delay of a state after the full second, in seconds, at which the monitor takes its sample.
+_STATE_DELAY_S = 0.15
+# A state is sent again at most this many times in a second while the sample of the monitor is late.
 _MAX_LATE = 5
-"""How often a second a state is told again because the monitor's sample is late."""
-_SOONEST_S = 0.1
-"""An event changes the state, which is then told this long after, and at most this often."""
+# Delay of a state after an event, in seconds, and the shortest time between two states.
+_MIN_STATE_PERIOD_S = 0.1
 
 
 class Operations:
@@ -42,7 +47,7 @@ class Operations:
         self._watchers = 0
 
     def take_event(self, event: Event) -> None:
-        """Take an event of the platform, and pass it on to the commands that wait for an operation."""
+        """Pass an event of the platform on to the commands that wait for an operation."""
         for listener in list(self._listeners):
             listener(event)
 
@@ -68,15 +73,15 @@ class Operations:
         A state comes as ``{"state": {...}}``; an event has ``time_s``, Unix time, and ``number``.
 
         Raises:
-            UsageError: `_MAX_WATCHERS` others watch.
+            UsageError: `_MAX_WATCHERS` connections watch already.
         """
         if self._watchers >= _MAX_WATCHERS:
-            raise UsageError(f"{_MAX_WATCHERS} others watch already", hint="end one of them")
+            raise UsageError(f"{_MAX_WATCHERS} connections watch already", hint="end one of them")
         return self._yield_states_and_events(state)
 
     async def _yield_states_and_events(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
         loop = asyncio.get_running_loop()
-        events: asyncio.Queue[Event] = asyncio.Queue(_MAX_UNHEARD)
+        events: asyncio.Queue[Event] = asyncio.Queue(_MAX_WAITING_EVENTS)
         number = 0
 
         def take(event: Event) -> None:
@@ -95,17 +100,18 @@ class Operations:
                 left_s = due_s - loop.time()
                 if left_s <= 0 and events.empty():
                     document = state()
-                    due_s = (math.floor((loop.time() - _AFTER_S) / _LOOK_S) + 1) * _LOOK_S + _AFTER_S
+                    past = math.floor((loop.time() - _STATE_DELAY_S) / _STATE_PERIOD_S)
+                    due_s = (past + 1) * _STATE_PERIOD_S + _STATE_DELAY_S
                     if sample is not None and document.get("sample") == sample and late < _MAX_LATE:
                         late += 1
-                        due_s = min(due_s, loop.time() + _SOONEST_S)
+                        due_s = min(due_s, loop.time() + _MIN_STATE_PERIOD_S)
                     else:
                         sample, late = document.get("sample"), 0
                     yield {"state": document}
                     continue
                 with contextlib.suppress(asyncio.TimeoutError):
                     yield await asyncio.wait_for(events.get(), max(left_s, 0.001))
-                    due_s = min(due_s, loop.time() + _SOONEST_S)
+                    due_s = min(due_s, loop.time() + _MIN_STATE_PERIOD_S)
         finally:
             self._watchers -= 1
             self._listeners.discard(take)

@@ -21,20 +21,23 @@ from rse_pf.local.servers.control_client import ControlPort
 __all__ = ["OperatedPlatform", "OperatorPort"]
 
 Event = Mapping[str, Any]
+# Robots of one request to move: the default of `serving.max_robots`.
 _MAX_MOVED = 10_000
+# Time over which these robots are asked to move, in seconds.
 _SPREAD_S = 1.0
-_ASK_S = 2.0
+# Time limit of the request to the server, in seconds.
+_MOVE_TIMEOUT_S = 2.0
 
 
 class OperatedPlatform(Protocol):
-    """What the port needs of a `LocalPlatform`, which imports this module."""
+    """The part of `LocalPlatform` that the port uses; `LocalPlatform` imports this module."""
 
     @property
     def servers(self) -> Sequence[BackendServer]:
-        """The servers that serve."""
+        """The servers that take robots."""
 
     def status_document(self) -> dict[str, Any]:
-        """Return everything that is known, as plain JSON values."""
+        """Return the state of the platform as plain JSON values."""
 
     def check_drain(self, name: str) -> Any:
         """Raise UsageError if *name* cannot be drained."""
@@ -156,11 +159,11 @@ class OperatorPort:
 
     async def _ask_to_move(self, name: str, port: ControlPort, robots: int) -> None:
         target = f"/move?robots={robots}&spread_s={_SPREAD_S:g}"
-        reply = await port.ask_once(target, timeout_s=_ASK_S, method="POST")
+        reply = await port.ask_once(target, timeout_s=_MOVE_TIMEOUT_S, method="POST")
         answer = {} if reply is None else reply.document()
         if reply is None or reply.status >= 300 or answer.get("under_way"):
             raise UsageError(
-                f"{name} lets no robot move now",
+                f"{name} moves no robots now",
                 hint="its robots move already, or it drains; see rse-pf local status",
             )
         self._emit(

@@ -1,8 +1,8 @@
 """The whole platform on one machine: a real load balancer in front of real backend servers.
 
-``async with LocalPlatform(settings, state=folder) as platform`` is all that a demo, an experiment or a test
-needs.  Nothing that it started is left running, however the block ends, unless the platform is adoptable and
-was killed with SIGKILL.  It grows, shrinks and replaces servers by itself only if it is elastic.
+``async with LocalPlatform(settings, state=folder) as platform`` starts everything that a demo, an
+experiment or a test needs.  Nothing that it started is left running, however the block ends,
+unless the platform is adoptable and was killed with SIGKILL.  It grows, shrinks and replaces servers by itself only if it is elastic.
 """
 
 from __future__ import annotations
@@ -73,12 +73,14 @@ __all__ = ["LocalPlatform"]
 Event = Mapping[str, Any]
 
 _LOOPBACK = "127.0.0.1"
-_ASK_S = 1.0
+# Time limit of a request to a server's control port, in seconds.
+_STATUS_TIMEOUT_S = 1.0
+# Newest events in the status document.
 _LAST_EVENTS = 50
+# File for ``file_sd_configs`` of Prometheus, in the folder of the state file.
 _TARGETS_FILE = "prometheus_sd.json"
-"""Beside the state file, for ``file_sd_configs`` of Prometheus."""
+# Size above which a log is rotated; one rotated log is kept.
 _LOG_FILE_BYTES = 64 << 20
-"""A log that has grown longer is set aside, in place of the one set aside before."""
 
 
 class LocalPlatform:
@@ -260,7 +262,7 @@ class LocalPlatform:
         return [page for page in pages if page is not None]
 
     def status_document(self) -> dict[str, Any]:
-        """Return everything the control plane knows, as plain JSON values."""
+        """Return the state of the platform as plain JSON values."""
         mark = self.load_balancer.process.mark
         sample = self.sample
         servers = [
@@ -569,7 +571,7 @@ class LocalPlatform:
         if not server.port:
             return None
         port = self.backend_servers.control(server.control_port)
-        reply = await port.ask_once("/status", timeout_s=_ASK_S)
+        reply = await port.ask_once("/status", timeout_s=_STATUS_TIMEOUT_S)
         return None if reply is None else str(reply.document().get("settings", "")) or None
 
     async def _begin_data(self, previous: ServerState | None) -> None:
@@ -578,7 +580,7 @@ class LocalPlatform:
             await self._begin_single(self.data_servers, DATA_CLUSTER, previous)
 
     async def _begin_rosbridge(self, previous: PlatformState | None) -> None:
-        """Start the rosbridge server, or adopt the one of *previous* if the balancer that it knows lives."""
+        """Start the rosbridge server, or adopt the one of *previous* if its balancer still runs."""
         if not self.load_balancer.loopback_port:
             # The balancer was started without rosbridge, or by an earlier release, and keeps its listeners.
             self._emit("rosbridge-failed", name="rosbridge", error="the platform has to be restarted for it")

@@ -1,7 +1,7 @@
-"""When robots of crowded servers are asked to move: for half a minute after servers or robots came back.
+"""Decide when robots of crowded servers move: within half a minute after servers or robots came back.
 
-`rse_pf.scaling.rebalance.moves` says how many.  None is asked while the numbers still change, and a request
-is not repeated before its robots had time to move and to be counted on their new server.
+`rse_pf.scaling.rebalance.moves` says how many.  No robot moves while the numbers still change,
+and a request is not repeated before its robots are counted on their new server.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ from rse_pf.scaling.rebalance import moves
 
 __all__ = ["MoveRequest", "Rebalancer"]
 
+# Time for which the spread is watched after a change, in seconds.
 _WATCH_S = 30.0
+# Time after a request until its robots are counted on their new server, in seconds.
 _SETTLE_S = 1.5
+# No robot moves while more than this share of all robots changes from one sample to the next.
 _STEADY_SHARE = 0.1
-"""Of all robots; numbers that change by more from one sample to the next are not acted on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +33,7 @@ class MoveRequest:
 
 
 class Rebalancer:
-    """Remembers until when the spread of the robots is watched."""
+    """Keeps the time until which the spread of the robots is watched."""
 
     def __init__(self) -> None:
         self._until_s = -math.inf

@@ -1,9 +1,12 @@
 """The scale modifier box on one machine: carry out what the policy decides.
 
-The policy names the servers to replace; three rules here say when.  A server that died is replaced at once.
-Replacements of servers that died soon after their start are limited in number per minute (a crash loop).
-Servers that run but fail their checks are never replaced all at once: then the fault is more likely in the
-monitor or the machine.  Time is an argument, and the effects are those of the `Fleet`.
+The policy names the servers to replace; three rules here decide when:
+1. A server whose process ended is replaced at once.
+2. Replacements of servers that ended soon after their start are limited in number per minute (a crash loop).
+3. Servers that run but fail their checks are never replaced all at once: then the fault is more likely in the
+   monitor or the machine.
+
+Time is an argument, and the effects are those of the `Fleet`.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ def bounds_for(scaling: ScalingSettings, count: int) -> ScalingSettings:
 
 
 def may_start_s(starts: Sequence[float], *, now_s: float, per_minute: int) -> float:
-    """Return when a replacement of a server that died young may start; *now_s* means at once.
+    """Return when a server that ended soon after its start may be replaced; *now_s* means at once.
 
     Args:
         starts: When replacements were started, in order.
@@ -43,9 +46,9 @@ def may_start_s(starts: Sequence[float], *, now_s: float, per_minute: int) -> fl
 
 
 def replace_now(broken: Sequence[str], *, healthy: int, replacing: int) -> tuple[str, ...]:
-    """Return which of the living *broken* servers are replaced now: the rest may recover meanwhile.
+    """Return which of the running *broken* servers are replaced now; the others may recover meanwhile.
 
-    At most half as many as there are healthy ones are being replaced at a time, and at least one.
+    At a time at most half as many are replaced as there are healthy ones, and at least one.
     """
     return tuple(broken[: max(max(1, healthy // 2) - replacing, 0)])
 
@@ -53,7 +56,7 @@ def replace_now(broken: Sequence[str], *, healthy: int, replacing: int) -> tuple
 class LocalScaleModifier:
     """Applies the policy to the servers of a `Fleet`.
 
-    It remembers when it acted, what it started, and since when each rule holds.
+    It keeps the times of its actions and replacements, and since when each rule holds.
     """
 
     def __init__(
@@ -82,14 +85,14 @@ class LocalScaleModifier:
     def act(
         self, samples: Sequence[Sample], *, now_s: float, period_over: bool, hold: bool = False
     ) -> tuple[Action, ...]:
-        """Decide, do it, and return what was decided.
+        """Decide, carry the actions out, and return them.
 
         Args:
             samples: Of whole periods.
             now_s: The clock of the samples.
             period_over: Whether the newest period is complete; between periods nothing is grown or shrunk,
                 unless servers are missing.
-            hold: Only replace: an operator is changing the number of servers.
+            hold: Only replace servers, because an operator is changing their number.
         """
         self._starts = [start for start in self._starts if now_s - start < _MINUTE_S]
         self._in_crash_loop = self._in_crash_loop and bool(self._starts)
@@ -150,9 +153,9 @@ class LocalScaleModifier:
                 self._last = action
 
     def _replace(self, standing: ServerHealth, now_s: float) -> None:
-        for name, young in standing.dead.items():
+        for name, ended_early in standing.dead.items():
             at_s = may_start_s(self._starts, now_s=now_s, per_minute=self._restarts_per_minute)
-            if young and at_s > now_s:
+            if ended_early and at_s > now_s:
                 self._report_crash_loop(name, at_s - now_s)
             else:
                 self._launch_replacement(name, "it ended", now_s)

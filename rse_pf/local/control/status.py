@@ -29,9 +29,10 @@ from rse_pf.terminal import printable
 
 __all__ = ["data_url", "platform_status", "status_table"]
 
+# Time limit of a request to a server, in seconds.
 _TIMEOUT_S = 0.5
+# Tenants with the most CPU time that the table names; --json has all.
 _MAX_TENANTS = 5
-"""The table names those that took most; --json has all."""
 _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 

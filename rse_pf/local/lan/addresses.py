@@ -1,6 +1,6 @@
 """The address at which other machines of the network reach this one.
 
-No packet is sent: the routing table tells which of the machine's addresses a packet would carry.
+No packet is sent: the routing table gives the source address that a packet would have.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from rse_pf.errors import ConfigurationError, UsageError
 
 __all__ = ["check_lan_address", "host_names", "lan_address"]
 
-_ELSEWHERE = (("192.0.2.1", socket.AF_INET), ("2001:db8::1", socket.AF_INET6))
-"""Addresses for documentation (RFC 5737, RFC 3849), which belong to nobody."""
+_REMOTE = (("192.0.2.1", socket.AF_INET), ("2001:db8::1", socket.AF_INET6))
+"""Addresses that are reserved for documentation (RFC 5737, RFC 3849)."""
 _PORT = 9
 _EXAMPLE = "for example: --lan 192.168.1.20; ip address shows the addresses of this machine"
 
@@ -24,7 +24,7 @@ def lan_address() -> str:
     Raises:
         ConfigurationError: No route leads out of this machine.
     """
-    for address, family in _ELSEWHERE:
+    for address, family in _REMOTE:
         try:
             with socket.socket(family, socket.SOCK_DGRAM) as trial:
                 trial.connect((address, _PORT))  # a datagram socket only looks up the route

@@ -28,10 +28,11 @@ from rse_pf.storage.files import OWNER_ONLY, read_private_file, replace_file
 __all__ = ["CERTIFICATE_NAME", "LanListener", "authority_file", "secret_document", "secret_file"]
 
 CERTIFICATE_NAME = "front-door"
-"""Of the listener's certificate in Envoy's file."""
+"""Name of the listener's certificate in Envoy's file."""
+# A certificate is renewed when it is valid for less than this, in seconds.
 _RENEW_S = SERVER_S / 3
-"""A certificate that is valid for less than this is replaced."""
-_LOOK_EVERY_S = 3600.0
+# Time between two checks of the certificate, in seconds.
+_CHECK_EVERY_S = 3600.0
 _LOOPBACK = "127.0.0.1"
 _HINT = "remove the file; robots must be enrolled again"
 
@@ -65,7 +66,7 @@ class LanListener:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the certificate is for: the address, and the names of this machine."""
+        """The subjects of the certificate: the address, and the names of this machine."""
         return (self.address, *host_names(), _LOOPBACK)
 
     def prepare(self, platform: str, *, now_s: float) -> bool:
@@ -116,7 +117,7 @@ class LanListener:
     ) -> None:
         """Renew the certificate before it expires, until cancelled; *problem* gets why that failed."""
         while True:
-            await asyncio.sleep(_LOOK_EVERY_S)
+            await asyncio.sleep(_CHECK_EVERY_S)
             try:
                 if self.prepare(platform, now_s=time.time()):
                     renewed()

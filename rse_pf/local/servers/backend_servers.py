@@ -31,7 +31,8 @@ RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 """The program; ``serve`` and its options follow."""
 
 _LOOPBACK = "127.0.0.1"
-_ASK_S = 1.0
+# Time limit of a request to a server's control port, in seconds.
+_STATUS_TIMEOUT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +98,7 @@ class LocalBackendServers:
             server.start([*self._program, *command], dies_with_parent=self._dies_with_parent)
 
     def adopt(self, name: str, mark: ProcessMark) -> None:
-        """Know a server that an earlier control plane launched as *name*, ready or not."""
+        """Take over a server that an earlier control plane launched as *name*, ready or not."""
         self._processes[name] = ServerProcess(name, self._folder)
         self._processes[name].mark = mark
 
@@ -127,13 +128,13 @@ class LocalBackendServers:
         return ControlPort(port, read_control_token(control_token_file(self._folder)))
 
     async def status(self, server: BackendServer) -> dict[str, Any] | None:
-        """Return what the server says of itself on its control port; None when it does not answer."""
-        reply = await self.control(server.control_port).ask_once("/status", timeout_s=_ASK_S)
+        """Return the /status page of *server*; None when it does not answer."""
+        reply = await self.control(server.control_port).ask_once("/status", timeout_s=_STATUS_TIMEOUT_S)
         return None if reply is None or reply.status != 200 else reply.document()
 
     async def metrics(self, server: BackendServer) -> str | None:
         """Return the server's page for Prometheus; None when it does not answer."""
-        reply = await self.control(server.control_port).ask_once("/metrics", timeout_s=_ASK_S)
+        reply = await self.control(server.control_port).ask_once("/metrics", timeout_s=_STATUS_TIMEOUT_S)
         return None if reply is None or reply.status != 200 else reply.body.decode("utf-8", "replace")
 
     async def wait_over(self, name: str) -> int | None:

@@ -1,7 +1,7 @@
 """Keep one server process warm: its imports take most of the time that a server needs to start.
 
-A replacement starts when a server has died and the others do its work.  The standby ends with the platform.
-A launch works without it too, only more slowly.
+A replacement starts while the other servers do the work of the one that ended.  The standby ends with the
+platform.  Without a standby a launch takes longer.
 
 Source:
     Warm pools of AWS Auto Scaling.
@@ -22,7 +22,8 @@ from rse_pf.local.processes import log_size, spawn
 
 __all__ = ["STANDBY", "WarmStandby"]
 
-_LOOK_AGAIN_S = 0.01
+# Time between two checks whether the standby is warm, in seconds.
+_POLL_S = 0.01
 STANDBY = (sys.executable, "-m", "rse_pf.cli.servers.standby")
 """The program; it reads its arguments from standard input."""
 
@@ -68,7 +69,7 @@ class WarmStandby:
         end = time.monotonic() + timeout_s
         self.warm()
         while self._program and not self.is_warm and time.monotonic() < end:
-            await asyncio.sleep(_LOOK_AGAIN_S)
+            await asyncio.sleep(_POLL_S)
 
     def take(self, arguments: Sequence[str], log: Path) -> subprocess.Popen[bytes] | None:
         """Turn the standby into the program of *arguments*, which writes to *log*; None if there is none."""
@@ -79,7 +80,7 @@ class WarmStandby:
         try:
             process.stdin.write(order.encode() + b"\n")
             process.stdin.close()
-        except OSError:  # it has just died
+        except OSError:  # it has just ended
             self.close()
             return None
         self._process = None

@@ -1,7 +1,7 @@
 """A server of one process on one machine: started, watched and replaced; of data, or of rosbridge clients.
 
 A replacement takes the port of the process before it, so the load balancer's configuration does not change.
-A process that answers no health check any more is killed and replaced like one that died.
+A process that answers no health check any more is killed and replaced like one that has ended.
 """
 
 from __future__ import annotations
@@ -21,12 +21,16 @@ from rse_pf.processes.linux import run_as_batch
 
 __all__ = ["CHECK_S", "NICENESS", "WatchedServer"]
 
+# Time between two checks of the service, and time limit of one, in seconds.
 CHECK_S = 1.0
-"""Between two checks of the service, and how long one may take."""
-_FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
+# First pause between two failed starts, in seconds; each next one is twice as long.
+_FIRST_PAUSE_S = 0.1
+# Longest pause between two failed starts, in seconds.
+_MAX_PAUSE_S = 5.0
+# Time between two checks whether a full disk has space again, in seconds.
 _WAIT_FOR_SPACE_S = 0.5
+# Niceness of these servers: on one machine poses have priority.
 NICENESS = 10
-"""Of these servers: on one machine poses go first."""
 
 
 class WatchedServer:
@@ -58,8 +62,8 @@ class WatchedServer:
             folder: Gets the log and the announcement.
             command: What to run; ``--announce`` and ``--port`` with their values follow.
             ready: Path that answers 200 while requests can be served.
-            alive: Path that answers 200 while the process need not be replaced.
-            event: What the names of the events begin with.
+            alive: Path that answers 200 unless the process must be replaced.
+            event: Prefix of the names of events.
             unhealthy_checks: After more failed checks than these, the process is killed.
             start_timeout_s: How long a start may take.
             dies_with_parent: Whether the process ends when this one does.
@@ -92,7 +96,7 @@ class WatchedServer:
         return None if mark is None else ServerState(name=name, process=mark, port=self.port)
 
     def document(self) -> list[dict[str, Any]]:
-        """Return what is known of it, as plain JSON values."""
+        """Return name, pid, port and whether it runs, as plain JSON values; empty before the first start."""
         name, mark = self.process.name, self.process.mark
         running = self.process.is_running()
         return (

@@ -17,12 +17,12 @@ from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server, read_group
-from rse_pf.extensions.fleet_page.feeds.cloud_metrics import read_group_metrics
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
-from rse_pf.extensions.fleet_page.feeds.cloud_overview import read_overview
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
+from rse_pf.extensions.fleet_page.feeds.cloud_metrics import read_group_metrics
+from rse_pf.extensions.fleet_page.feeds.cloud_overview import read_overview
 from rse_pf.scaling.alarms import NAMESPACE
 from tests.kit.emulated_aws import REGION, emulated_aws
 from tests.kit.fake_machine import FakeMachine, FakeScaling, agent_context

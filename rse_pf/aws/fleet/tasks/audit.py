@@ -6,8 +6,8 @@ from rse_pf.aws.fleet.task import AgentContext, Task
 
 __all__ = ["AUDIT_SHIP_S", "task"]
 
+# Time between two uploads, in seconds: a machine that fails loses the entries of at most a minute.
 AUDIT_SHIP_S = 60.0
-"""Time between two uploads; a machine that fails loses at most this much, if it could reach S3."""
 
 
 def task(context: AgentContext) -> Task:

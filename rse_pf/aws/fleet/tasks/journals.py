@@ -13,11 +13,11 @@ from rse_pf.storage.files import replace_file
 
 __all__ = ["JOURNAL_SHIP_S", "piece_name", "task"]
 
+# Time between two uploads, in seconds: a machine that fails loses the lines of at most a minute.
 JOURNAL_SHIP_S = 60.0
-"""Time between two uploads; a machine that fails loses at most this much."""
 _CURSOR_FILE = "journal.cursor"
+# Pieces of one call, which blocks the other tasks; later calls ship the rest.
 _MAX_PIECES = 8
-"""In one call; what is left is shipped in the next ones."""
 
 
 def task(context: AgentContext) -> Task:

@@ -1,7 +1,7 @@
 """Follow the lifecycle of the instance in its group: join it when ready, wait while warmed, drain at the end.
 
-Auto Scaling writes the state that an instance is on its way to into the instance's metadata.  The agent
-completes the launch hook for each such way, because a warmed instance that is used later waits again.
+Auto Scaling publishes the target state of an instance in the instance's metadata.  The agent completes the
+launch hook for each target state, because a warmed instance that is used later waits for the hook again.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rse_pf.scaling.boot_time import ready_within_s
 __all__ = ["task"]
 
 _POLL_S = 5.0
-"""Time between two reads of the lifecycle state; a launch or a drain waits this long at the most."""
+"""Time between two reads of the target state, in seconds; it delays a launch or a drain by no more."""
 
 
 def task(context: AgentContext) -> Task:
-    """Ask where the instance is to go, and do once what each way needs."""
+    """Read the target state, and join or leave the group once for each."""
     return Task(
         name="lifecycle",
         period_s=_POLL_S,
@@ -30,7 +30,7 @@ def task(context: AgentContext) -> Task:
 
 
 class _Lifecycle:
-    """What was done already: the target that the instance joined for, and whether its server has ended."""
+    """Progress of the instance: the target state that it joined, and whether its server has ended."""
 
     def __init__(self, context: AgentContext) -> None:
         self._context = context
@@ -46,7 +46,7 @@ class _Lifecycle:
             self._join(target)
 
     def _join(self, target: str) -> None:
-        """Complete the launch hook once the server is ready, or give the machine up."""
+        """Complete the launch hook when the server is ready, or abandon the machine after its time limit."""
         context, state = self._context, self._context.state
         if state.phase is Phase.WARMED:
             state.phase = Phase.STARTING
@@ -69,7 +69,7 @@ class _Lifecycle:
         context.state.phase = Phase.LEAVING
         if self._drained is None:
             context.log("leaving", group=context.config.group)
-            context.state.flush()  # most of the log is uploaded before time is short
+            context.state.flush()  # upload most of the logs before the drain, which has a time limit
             self._drained = drain_server(
                 context.machine, settings=context.settings, clock=context.clock, sleep=context.sleep
             )

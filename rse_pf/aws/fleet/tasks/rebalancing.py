@@ -1,8 +1,8 @@
-"""Move robots of this server when it has too many, so that a new server relieves those who are connected.
+"""Move robots away from this server when it has too many, so that a new server takes its share.
 
-No agent knows the other servers.  Each reads from CloudWatch how many robots all servers have, and how many
+Agents do not communicate.  Each reads from CloudWatch how many robots all servers have, and how many
 servers published that; `rse_pf.scaling.rebalance.share` says how many of its own are too many.  Nothing moves
-while these numbers still change, and moves do not change them, so the agents need not agree.
+while these numbers still change, and moves do not change them, so agents need no coordination.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from rse_pf.scaling.rebalance import MoveOrder, Totals, pause_after_s, plan_orde
 
 __all__ = ["LATE_S", "read_totals", "task"]
 
+# Seconds from the end of a period until its numbers are read: one for the agents, the rest for CloudWatch.
 LATE_S = 8.0
-"""Numbers of a period are read so long after its end: a second for the agents, a few for CloudWatch."""
-
+# Periods that are read: two are compared, and CloudWatch may lack the newest ones.
 _PERIODS = 4
 
 
 def task(context: AgentContext) -> Task:
-    """Read the sums once in each period, and order the server to move what is too much."""
+    """Read the totals once in each period, and have the server move its surplus of robots."""
     return Task(
         name="rebalancing",
         period_s=0.0,
@@ -41,8 +41,8 @@ def task(context: AgentContext) -> Task:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Asked:
-    """The last order, and how many robots the server had then."""
+class _LastOrder:
+    """The last order, and the number of robots that the server had then."""
 
     order: MoveOrder
     robots: int
@@ -55,7 +55,7 @@ class _Rebalancing:
         self._period_s = cadence_of(context.settings.scaling).period_s
         self._period = -1
         self._quiet_until_s = -math.inf
-        self._asked: _Asked | None = None
+        self._asked: _LastOrder | None = None
 
     def follow(self) -> None:
         """Look once in each period, and not while the robots of the last order still move."""
@@ -84,7 +84,7 @@ class _Rebalancing:
         moving = context.machine.move(order.robots, order.spread_s)
         failures = 0 if self._asked is None else self._asked.failures
         stayed = self._asked is not None and robots >= self._asked.robots
-        self._asked = _Asked(order=order, robots=robots, failures=failures + 1 if stayed else 0)
+        self._asked = _LastOrder(order=order, robots=robots, failures=failures + 1 if stayed else 0)
         pause_s = pause_after_s(order, within_s=MOVE_WITHIN_MS / 1e3, failures=self._asked.failures)
         self._quiet_until_s = context.clock() + pause_s
         newest = totals[0]

@@ -22,14 +22,14 @@ _HIGH_RESOLUTION = 1
 
 
 def task(context: AgentContext) -> Task:
-    """Publish what the server did in each period; the first call only takes the counts."""
+    """Publish the metrics of each period; the first call only reads the counters."""
     return Task(
         name="metrics", period_s=0.0, call=_Publisher(context).publish, phases=frozenset({Phase.SERVING})
     )
 
 
 class _Publisher:
-    """The numbers at the end of the last period that was published."""
+    """Keeps the counters at the end of the last published period."""
 
     def __init__(self, context: AgentContext) -> None:
         self._context = context
@@ -47,7 +47,7 @@ class _Publisher:
             return
         now, cpu = read_page(machine.page()), machine.cpu_times() if self._cadence.is_fast else (0.0, 0.0)
         if self._period < 0:
-            self._began_s = context.clock()  # counts from before the agent's start belong to no period
+            self._began_s = context.clock()  # counts before the agent's start belong to no period
         else:
             data = datums(self._before, now, context.config.group, machine.instance_id())
             if self._cadence.is_fast:
@@ -60,11 +60,11 @@ class _Publisher:
 
     def _measure_cpu_percent(self, now: tuple[float, float]) -> list[dict[str, Any]]:
         """Return the CPU of the machine, once the server is past its warm-up."""
-        busy, there = (ticks - before for ticks, before in zip(now, self._cpu_before, strict=True))
+        busy, total = (ticks - before for ticks, before in zip(now, self._cpu_before, strict=True))
         warm = self._context.clock() - self._began_s >= self._context.settings.scaling.warm_up_s
-        if not warm or there <= 0:
+        if not warm or total <= 0:
             return []
-        value = round(100.0 * min(max(busy / there, 0.0), 1.0), 2)
+        value = round(100.0 * min(max(busy / total, 0.0), 1.0), 2)
         dimensions = dimensions_of(self._context.config.group)
         return [{"MetricName": CPU, "Dimensions": dimensions, "Value": value, "Unit": "Percent"}]
 

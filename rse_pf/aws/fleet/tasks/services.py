@@ -23,7 +23,7 @@ from rse_pf.services.custom.publishing import (
 __all__ = ["FOLDER", "task"]
 
 FOLDER = "services"
-"""In the agent's state folder; the units name it, too."""
+"""Folder of the services in the agent's state folder; the systemd units name it, too."""
 _EMPTY = msgspec.json.encode(PublishedList())
 
 

@@ -2,7 +2,7 @@
 
 The notice comes two minutes before the interruption: robots move within seconds, and the machine stays idle
 until it is taken.  A recommendation to rebalance may come earlier, to all servers of a pool at once, and is
-only noted: the group starts a replacement (`stacks.capacity`), and then ends this one by its drain hook.
+only logged: the group starts a replacement (`stacks.capacity`), and then ends this one by its drain hook.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from rse_pf.aws.fleet.task import AgentContext, Phase, Task
 
 __all__ = ["LOOK_EVERY_S", "task"]
 
+# Time between two reads of the notice, in seconds: a drain begins less than 5 s after it.
 LOOK_EVERY_S = 2.0
-"""A drain begins within this, a step of the agent and a request: less than 5 s after the notice."""
 
 
 def task(context: AgentContext) -> Task:
-    """Look for a notice every two seconds, where there are Spot instances, and drain once."""
+    """Read the notice every two seconds on Spot deployments, and drain once."""
     is_spot = context.settings.cloud.spot
     last = ""
 

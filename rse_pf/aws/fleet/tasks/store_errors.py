@@ -1,7 +1,7 @@
-"""Publish that the bucket does not answer this server's data service: an alarm, and no server ends.
+"""Publish that the bucket does not answer this server's data service, for an alarm; no server is replaced.
 
-All servers share the bucket, so a server that is replaced for it helps nobody, and its replacement could not
-even boot.  Robots get typed errors for their data meanwhile, and poses as ever.
+All servers share the bucket, so replacing a server would not help, and its replacement could not boot.
+Meanwhile robots get typed errors for their data, and poses as before.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _HIGH_RESOLUTION = 1
 
 
 def task(context: AgentContext) -> Task:
-    """Look every ten seconds, in a thread: calls of the other tasks wait for a bucket that is silent."""
+    """Check every ten seconds, in a thread, because a check of a silent bucket blocks for seconds."""
     failing = False
 
     def publish_failure() -> None:

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
-from rse_pf.extensions.fleet_page.feeds.cloud_metrics import GroupMetrics, read_group_metrics
-from rse_pf.extensions.fleet_page.feeds.cloud_overview import CloudOverview, ScalingActivity, read_overview
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
+from rse_pf.extensions.fleet_page.feeds.cloud_metrics import GroupMetrics, read_group_metrics
+from rse_pf.extensions.fleet_page.feeds.cloud_overview import CloudOverview, ScalingActivity, read_overview
 from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
 from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.local.together import run_together

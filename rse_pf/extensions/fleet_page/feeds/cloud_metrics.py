@@ -1,4 +1,4 @@
-"""Read what CloudWatch knows of the group and its servers over the last hour, in one request.
+"""Read the metrics of the group and of its servers over the last periods, in one request to CloudWatch.
 
 AWS charges 0.01 USD for 1000 metrics of such requests.  A number that nobody published is None, never zero.
 """
@@ -18,8 +18,11 @@ from rse_pf.scaling.alarms import NAMESPACE
 
 __all__ = ["PERIODS", "GroupMetrics", "read_group_metrics"]
 
+# Periods of a graph: an hour of one-minute samples.
 PERIODS = 60
+# A number that is older than this many periods is shown as unknown.
 _FRESH_PERIODS = 3
+# Servers of one request, two metrics each: GetMetricData takes 500 queries.
 _MAX_SERVERS = 200
 _EC2 = "AWS/EC2"
 _GROUP_SERIES = {

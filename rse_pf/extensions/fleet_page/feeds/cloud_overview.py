@@ -1,7 +1,7 @@
-"""Read what AWS knows of a deployment at one moment: the group, its load balancer, and what it did last.
+"""Read the state of a deployment on AWS: the group, its load balancer, and its last scaling activities.
 
-Nothing is changed, and nothing here is charged for.  Of the parts, only the group must be readable: what AWS
-refuses beside it is a sentence in `CloudOverview.problems`.
+Nothing is changed, and AWS charges for none of these calls.  Only the group must be readable; each other
+part that AWS refuses is a sentence in `CloudOverview.problems`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from rse_pf.errors import RsePfError
 
 __all__ = ["CloudBalancer", "CloudOverview", "ScalingActivity", "read_overview"]
 
-_ACTIVITIES = 50
+# Newest scaling activities that are read: one page of the answer, hours of a busy group.
+_MAX_ACTIVITIES = 50
+# AWS takes at most this many values in one filter.
+_MAX_FILTER_VALUES = 200
 _FAILED = ("Failed", "Cancelled")
 
 T = TypeVar("T")
@@ -36,7 +39,7 @@ class CloudBalancer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScalingActivity:
-    """What the group did, or tries to do; ``began_s`` is in Unix seconds."""
+    """One launch or termination of a server, done or tried; ``began_s`` is in Unix seconds."""
 
     id: str
     began_s: float
@@ -46,7 +49,7 @@ class ScalingActivity:
 
     @property
     def has_failed(self) -> bool:
-        """Whether it ended without what it was for."""
+        """Whether it failed or was cancelled."""
         return self.status in _FAILED
 
 
@@ -117,7 +120,10 @@ def _read_launch_times_s(account: Account, names: list[str]) -> dict[str, float]
         return {}
     # By a filter: an id that is gone would be an error.
     rows = account.pages(
-        "ec2", "describe_instances", "Reservations", Filters=[{"Name": "instance-id", "Values": names[:200]}]
+        "ec2",
+        "describe_instances",
+        "Reservations",
+        Filters=[{"Name": "instance-id", "Values": names[:_MAX_FILTER_VALUES]}],
     )
     return {
         str(instance["InstanceId"]): instance["LaunchTime"].timestamp()
@@ -128,7 +134,7 @@ def _read_launch_times_s(account: Account, names: list[str]) -> dict[str, float]
 
 def _read_activities(account: Account, group: str) -> tuple[ScalingActivity, ...]:
     answer = account.find(
-        "autoscaling", "describe_scaling_activities", AutoScalingGroupName=group, MaxRecords=_ACTIVITIES
+        "autoscaling", "describe_scaling_activities", AutoScalingGroupName=group, MaxRecords=_MAX_ACTIVITIES
     )
     rows = (answer or {}).get("Activities", ())
     return tuple(
