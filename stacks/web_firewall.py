@@ -35,10 +35,10 @@ _BODY_TEXT = {
         "and burst.commands_per_5_minutes for commands sent to the function"
     ),
 }
-_NO_TOKEN = "burst-needs-a-token"
-_NO_TOKEN_BODY = "no-token"
-_NO_TOKEN_STATUS = 401
-_NO_TOKEN_TEXT = {
+_BURST_RULE = "burst-needs-a-token"
+_UNAUTHORIZED_BODY = "no-token"
+_UNAUTHORIZED_STATUS = 401
+_UNAUTHORIZED_TEXT = {
     "code": "unauthorized", "message": "the token is missing or not valid",
     "hint": "issue one with rse-pf token issue ROBOT",
 }  # fmt: skip
@@ -59,8 +59,8 @@ class WebFirewall(Construct):
                 _BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
                     content=json.dumps(_BODY_TEXT), content_type="APPLICATION_JSON"
                 ),
-                _NO_TOKEN_BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
-                    content=json.dumps(_NO_TOKEN_TEXT), content_type="APPLICATION_JSON"
+                _UNAUTHORIZED_BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
+                    content=json.dumps(_UNAUTHORIZED_TEXT), content_type="APPLICATION_JSON"
                 ),
             },
             rules=[
@@ -106,11 +106,11 @@ def _burst_token_rule(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
         not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=looks_right)
     )
     return wafv2.CfnWebACL.RuleProperty(
-        name=_NO_TOKEN, priority=place, visibility_config=_metrics_only(f"{prefix}-{_NO_TOKEN}"),
+        name=_BURST_RULE, priority=place, visibility_config=_metrics_only(f"{prefix}-{_BURST_RULE}"),
         action=wafv2.CfnWebACL.RuleActionProperty(
             block=wafv2.CfnWebACL.BlockActionProperty(
                 custom_response=wafv2.CfnWebACL.CustomResponseProperty(
-                    response_code=_NO_TOKEN_STATUS, custom_response_body_key=_NO_TOKEN_BODY
+                    response_code=_UNAUTHORIZED_STATUS, custom_response_body_key=_UNAUTHORIZED_BODY
                 )
             )
         ),

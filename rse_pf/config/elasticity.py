@@ -31,8 +31,8 @@ FAST_SAMPLES = 3
 """Busy samples in a row before the fast profile grows."""
 # Average CPU below which a fleet without commands is idle; a server without robots needs a few percent.
 IDLE_CPU_PERCENT = 20.0
+# Average CPU below which one server fewer is enough although robots send commands; `scaling.underused_s`.
 UNDERUSED_CPU_PERCENT = 15.0
-"""Average CPU below which a server can be spared although robots send commands; ``scaling.underused_s``."""
 
 _TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")
 _ARM = re.compile(r"a1|[a-z]+[0-9]+[a-z]*g[a-z]*")

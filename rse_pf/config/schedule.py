@@ -30,7 +30,7 @@ _HINT = 'write it as "weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduleEntry:
-    """From *hour*:*minute* on each of *days* (as in cron, 0 is Sunday) there are at least so many servers."""
+    """Least number of servers from *hour*:*minute* on each of *days*, which are as in cron (0 is Sunday)."""
 
     days: tuple[int, ...]
     hour: int

@@ -1,9 +1,10 @@
 #!/usr/bin/python3
 """Install a backend server on a plain Debian 12 machine; first_boot.py runs this file of the package as root.
 
-Uses the standard library only.  Unpacks the archives beside this file, which first_boot.py has verified, into
-a virtual environment with its bytecode, and starts the units.  A second run has the same result.  The server,
-its agent, the data service and the rosbridge server run as a user who may write one folder.
+Uses the standard library only.  Unpacks the archives in the folder of this file, which first_boot.py has
+verified, into a virtual environment with its bytecode, and starts the units.  A second run has the same
+result.  The server, its agent, the data service and the rosbridge server run as a user who may write one
+folder.
 """
 
 import json

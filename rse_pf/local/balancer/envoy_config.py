@@ -231,7 +231,7 @@ def _kernel_buffer(name: int) -> dict[str, Any]:
 
 
 def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
-    """End a connection whose robot reads nothing: Envoy would keep it, with all that is unread, for ever."""
+    """Close a connection whose robot reads nothing: Envoy would keep it and its unread bytes without end."""
     session = settings.session
     max_ms = int(2e3 * (session.ping_interval_s + session.ping_timeout_s))
     return {

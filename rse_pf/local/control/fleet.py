@@ -83,8 +83,8 @@ class ServerHealth:
     """Numbers and names of servers by state.
 
     ``servers`` counts all that exist or should: those that start, serve, fail their checks or ended
-    unexpectedly, but not those that drain.  ``broken`` run but fail their checks; ``dead`` ended unexpectedly, each
-    with whether it ended soon after its start.  ``replacing`` counts replacements that do not serve yet.
+    unexpectedly, but not those that drain.  ``broken`` run but fail their checks; ``dead`` have ended,
+    each with whether it ended soon after its start.  ``replacing`` counts replacements that do not serve yet.
     """
 
     servers: int

@@ -2,7 +2,8 @@
 
 ``async with LocalPlatform(settings, state=folder) as platform`` starts everything that a demo, an
 experiment or a test needs.  Nothing that it started is left running, however the block ends,
-unless the platform is adoptable and was killed with SIGKILL.  It grows, shrinks and replaces servers by itself only if it is elastic.
+unless the platform is adoptable and was killed with SIGKILL.  It grows, shrinks and replaces servers by
+itself only if it is elastic.
 """
 
 from __future__ import annotations

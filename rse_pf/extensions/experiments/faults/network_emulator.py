@@ -38,7 +38,12 @@ _HELD_BYTES = 1 << 20
 _BACKLOG = 1024
 _FILLERS = 2
 """Connections of its own that fill a listener's queue of one, with one to spare."""
-_FIRST_RETRY_S, _FIRST_DIAL_RETRY_S, _MAX_RETRY_S = 0.2, 1.0, 120.0
+# First time-out of a lost segment, in seconds; each next one is twice as long, as in TCP on Linux.
+_FIRST_RETRY_S = 0.2
+# First time-out of a lost segment of a handshake, in seconds.
+_FIRST_DIAL_RETRY_S = 1.0
+# Longest time-out, in seconds.
+_MAX_RETRY_S = 120.0
 _START_TIMEOUT_S = 20.0
 _TIMER_GRAIN_S = 0.0005
 """A timer of the loop rings up to a millisecond late; half of that early is right on average."""
