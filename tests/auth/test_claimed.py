@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.auth.claimed import claimed_by, source_address
+from rse_pf.auth.roster import EnrolledRobot, Roster
+from rse_pf.auth.tokens import KeySet
 from rse_pf.terminal import json_line
 
 HOSTILE = [
@@ -26,6 +28,19 @@ def part_of(value: Any) -> str:
 
 def token_of(claims: Any, key_id: Any = None) -> str:
     return f"{part_of({'alg': 'EdDSA', 'kid': key_id})}.{part_of(claims)}.c2ln"
+
+
+def test_the_tenant_of_a_robots_own_key_is_that_of_the_roster():
+    robot = EnrolledRobot(robot="robot-9", tenant="acme", x="A" * 43)
+    keys = KeySet({}, roster=Roster(robots=(robot,)))
+    claims = {"sub": "robot-9", "tenant": "default", "jti": "t-9"}
+    named = {"claimed_robot": "robot-9", "claimed_token": "t-9"}
+
+    enrolled = claimed_by(token_of(claims, robot.key_id), keys)
+    removed = claimed_by(token_of(claims, robot.key_id), KeySet({}))
+
+    assert enrolled == {**named, "claimed_tenant": "acme", "claimed_key": robot.key_id}
+    assert removed == {**named, "claimed_key": robot.key_id}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

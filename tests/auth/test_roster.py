@@ -8,6 +8,7 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from rse_pf.auth.roster import (
     DenyList,
@@ -104,6 +105,15 @@ def test_denied_tokens_are_refused_and_end_their_connections(denied: DenyList, r
 )
 def test_a_denial_applies_to_its_own_robot_and_tenant_only(denied: DenyList):
     assert verified(token(), trusted(denied)).robot == ENROLLED.id
+
+
+def test_a_robot_that_is_removed_or_has_a_new_key_loses_its_connections():
+    claims = verified(token(), trusted())
+    other = EnrolledRobot(robot="robot-2", tenant="lab", x=ENROLLED.x)
+
+    assert claims_problem(claims, trusted(roster=Roster())) == "unknown-key"
+    assert claims_problem(claims, trusted(roster=Roster(robots=(other,)))) == "wrong-robot"
+    assert claims_problem(replace(claims, key_id="p1"), KeySet({})) == "unknown-key"
 
 
 def test_pruning_removes_only_entries_about_expired_tokens():

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.placement import ServerPlacement, is_loopback
+from rse_pf.config.placement import ServerPlacement, is_loopback, live_ports
 from rse_pf.errors import SettingsError
 
 SETTINGS = PlatformSettings.from_dict({"serving": {"port": 9000, "workers": 3}})
@@ -51,6 +51,14 @@ def test_a_placement_that_makes_no_sense_is_refused_with_a_hint(
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.8.0.1", "::1", "localhost"])
 def test_a_loopback_address_and_the_name_localhost_are_reached_from_this_machine_alone(host: str) -> None:
     assert is_loopback(host)
+
+
+def test_owners_of_live_maps_have_known_ports_only_where_other_machines_connect() -> None:
+    elsewhere = SETTINGS.replace(live={"host": "0.0.0.0", "first_port": 8900})
+
+    assert live_ports(elsewhere.live) == range(8900, 8964)
+    assert live_ports(elsewhere.replace(live={"host": "127.0.0.2"}).live) == range(1)
+    assert live_ports(elsewhere.replace(live={"first_port": 0}).live) == range(1)
 
 
 @pytest.mark.parametrize(

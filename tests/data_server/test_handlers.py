@@ -36,6 +36,14 @@ def test_every_robot_of_the_tenant_sees_a_committed_map(service: Service) -> Non
     assert service.ask("GET", "/data/v1/maps", tenant="other").json["maps"] == []
 
 
+def test_the_second_commit_on_one_head_is_a_conflict_and_changes_nothing(service: Service) -> None:
+    first = send(service, 1, None)
+    send(service, 2, first.json["id"])
+
+    assert send(service, 3, first.json["id"]).status == 409
+    assert service.ask("GET", f"{MAPS}/versions/head").json["record"]["note"] == "seed 2"
+
+
 def test_an_invalid_map_or_an_object_of_another_robot_is_refused(service: Service) -> None:
     service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", b"x")
     body = json.dumps({"digest": digest_of(b"x")}).encode()

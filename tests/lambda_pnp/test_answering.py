@@ -18,7 +18,7 @@ from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Message, make_codec
+from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, make_codec
 from tests.kit.hostile_maps import hostile_maps
 
 SETTINGS = PlatformSettings()
@@ -70,11 +70,27 @@ def test_a_bad_token_is_rejected_before_anything_is_decoded(token: str) -> None:
     assert json.loads(answered.body)["code"] == "unauthorized"
 
 
+def test_an_expired_token_is_rejected() -> None:
+    late = NOW_S + SETTINGS.auth.token_ttl_s + SETTINGS.auth.leeway_s + 1
+    answered = answering().answer(event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0)
+
+    assert answered.status == 401
+
+
+def test_a_bomb_does_not_inflate() -> None:
+    assert failure(event(zlib.compress(b" " * 50_000_000))) == "too-large"
+
+
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
 def test_what_is_no_finite_number_is_a_bad_message(number: str) -> None:
     text = '{"type":"command","id":1,"service":"pnp","payload":{"points_world":[' + number + "]}}"
 
     assert failure(event(compressed(text))) in ("bad-message", "bad-request")
+
+
+def test_what_is_not_base64_or_no_command_is_a_bad_message() -> None:
+    assert failure({**event(b""), "body": "%%%"}) == "bad-message"
+    assert failure(event(make_codec("zlib").encode(Hello()))) == "bad-message"
 
 
 def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
@@ -169,6 +185,10 @@ def test_an_event_of_another_form_is_a_typed_400(what: Any) -> None:
 )
 def test_an_event_without_a_token_is_unauthorized(what: Any) -> None:
     assert rejected(what) == (401, "unauthorized")
+
+
+def test_a_huge_body_is_refused_by_its_length_before_it_is_decoded() -> None:
+    assert failure(event(b"") | {"body": "*" * 6_000_000}) == "too-large"
 
 
 @given(

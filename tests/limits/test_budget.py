@@ -71,6 +71,14 @@ def test_a_message_is_refused_exactly_when_what_it_holds_weighs_too_much(value):
         assert not too_much or len(data) <= SMALL.values // MAP_VALUES
 
 
+@given(data=st.binary(max_size=500))
+def test_counting_ends_for_bytes_that_are_not_messagepack(data):
+    try:
+        check_msgpack(data, SMALL)
+    except (LimitExceeded, BadMessage):
+        assert len(data) > SMALL.values // MAP_VALUES
+
+
 @pytest.mark.parametrize(
     "unit",
     [b"\x90", b"\x80", b"\xe0", b"\xd0\x80", b"\xa1z", b"\xd9\x01z", b"\xc4\x00", b"\xcb" + b"\x3f" * 8],
@@ -176,6 +184,11 @@ def test_a_value_within_a_message_is_measured_to_its_last_byte(value):
 def test_a_length_past_the_end_of_the_data_is_a_bad_message(data):
     with pytest.raises(BadMessage):
         check_msgpack(b"\x92" + msgspec.msgpack.encode(LONG) + data, WIDE)
+
+
+def test_bytes_after_a_message_are_a_bad_message():
+    with pytest.raises(BadMessage, match="follow"):
+        check_msgpack(msgspec.msgpack.encode(LONG) + b"\x01", WIDE)
 
 
 def test_inflating_refuses_what_is_not_one_stream():

@@ -11,10 +11,14 @@ from rse_pf.extensions.recording.redact import ConnectionRedactor, Pseudonyms
 from rse_pf.identity import RobotId
 from rse_pf.wire import (
     Command,
+    Failure,
     Hello,
+    Limits,
     Renew,
     Result,
     Subscribe,
+    Update,
+    Welcome,
     make_codec,
 )
 
@@ -69,6 +73,15 @@ def test_what_may_hold_a_token_or_a_name_is_left_out(codec: str, message: Any):
 
 
 @pytest.mark.parametrize("codec", CODECS)
+def test_an_answer_to_a_command_that_was_left_out_is_left_out(codec: str):
+    judge, encode = redactor(codec), make_codec(codec).encode
+    judge.up(encode(Command(id=2, service="merge")))
+
+    assert judge.down(encode(Result(id=2, reply={"robot": "someone"}))) is None
+    assert judge.down(encode(Update(id=3, topic="live/kitchen", seq=1))) is None
+
+
+@pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize(
     "message",
     [
@@ -85,6 +98,21 @@ def test_a_name_in_a_free_text_becomes_a_pseudonym(codec: str, message: Any):
     text = zlib.decompress(kept.data) if codec == "zlib" else kept.data
     assert not any(name.encode() in text for name in NAMES)
     assert text.count(b"robot-") + text.count(b"tenant-") >= 1
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_welcome_names_the_pseudonym_and_a_refusal_no_robot(codec: str):
+    judge, codec_ = redactor(codec), make_codec(codec)
+    limits = Limits(max_message_bytes=1, max_in_flight=1)
+    welcome = Welcome(server="s", session="x", robot="müller-7", protocol=1, limits=limits, clock_s=1.0)
+
+    kept = judge.down(codec_.encode(welcome))
+    refusal = judge.down(codec_.encode(Failure(code="busy", message="robot müller-7 is too fast")))
+
+    assert kept is not None
+    assert codec_.decode_from_server(kept.data).robot == judge.robot
+    assert refusal is not None
+    assert judge.robot in codec_.decode_from_server(refusal.data).message
 
 
 @pytest.mark.parametrize("codec", CODECS)

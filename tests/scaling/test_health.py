@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rse_pf.config import HealthSettings
-from rse_pf.scaling.health import Health, observe
+from rse_pf.scaling.health import Health, observe, time_to_notice_s
 
 SETTINGS = HealthSettings()
 
@@ -28,3 +28,8 @@ def test_two_failed_checks_in_a_row_make_a_healthy_server_unhealthy() -> None:
 def test_a_new_server_is_not_judged_before_the_grace_is_over() -> None:
     assert states("-" * 17)[-1] == "starting"
     assert states("-" * 18)[-1] == "unhealthy"
+
+
+def test_the_time_to_notice_adds_the_checks_and_the_last_timeout() -> None:
+    assert time_to_notice_s(SETTINGS, local=False) == 5 * 2 + 4
+    assert time_to_notice_s(SETTINGS, local=True) == 0.25 * 2 + 0.25

@@ -131,6 +131,10 @@ def test_a_pause_doubles_with_each_order_that_moved_nobody_up_to_ten_minutes() -
     assert [pause_after_s(order, within_s=5.0, failures=each) for each in (0, 1, 2, 9)] == [6, 12, 24, 600]
 
 
+def test_a_single_server_moves_no_robots() -> None:
+    assert share(100, 100, 1) == 0
+
+
 @pytest.mark.parametrize("servers", [2, 3, 5, 8])
 def test_an_empty_server_beside_full_ones_gets_four_fifths_of_the_average_under_both_rules(
     servers: int,

@@ -8,11 +8,28 @@ import msgspec
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, LimitExceeded, NotFound
+from rse_pf.errors import BadRequest, LimitExceeded, NotFound, StoreError
 from rse_pf.identity import RobotId, object_name
 from rse_pf.server.object_refs import resolve
-from rse_pf.storage.object_store import MemoryStore, digest_of
+from rse_pf.storage.object_store import MemoryStore, ObjectInfo, digest_of
 from tests.kit.fake_store import FakeStore
+
+
+class Counting(MemoryStore):
+    """A store that counts what is asked of it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heads = self.gets = 0
+
+    def head(self, name: str) -> ObjectInfo:
+        self.heads += 1
+        return ObjectInfo(name=name, size=len(super().get(name)))
+
+    def get(self, name: str) -> bytes:
+        self.gets += 1
+        return super().get(name)
+
 
 ROBOT = RobotId("lab", "robot-1")
 SERVING = PlatformSettings().serving
@@ -106,3 +123,10 @@ def test_more_than_a_command_may_refer_to_is_refused_before_it_is_read(
         resolve(Asked, payload, ROBOT, store)
 
     assert (store.calls["head"], store.calls["get"]) == (reads, 0)
+
+
+def test_an_object_that_changed_in_the_store_reaches_no_service(store: Counting) -> None:
+    store.put(object_name(ROBOT, digest_of(MAP)), b"rotten")
+
+    with pytest.raises(StoreError, match="digest"):
+        resolved({"one": name(MAP)}, store)

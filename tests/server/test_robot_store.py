@@ -5,14 +5,29 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.config import DataSettings
+from rse_pf.config import DataSettings, PlatformSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
+from rse_pf.server.jobs.process import JobRequest, store_reply
 from rse_pf.server.object_refs import ObjectRefs
 from rse_pf.server.robot_store import store_within_quota
-from rse_pf.storage.object_store import MemoryStore
+from rse_pf.storage.object_store import DirectoryStore, MemoryStore
 from rse_pf.storage.quotas import Accounts, charge_name
 from rse_pf.wire import Failure, Result
+
+ROBOT = RobotId("default", "robot-1")
+
+REQUEST = JobRequest(service="long", payload={}, robot=ROBOT, key="k", quota_bytes=4100.0)
+
+
+def of(store: str, max_message_bytes: int = 2000) -> PlatformSettings:
+    return PlatformSettings.from_dict(
+        {
+            "data": {"store": store, "max_object_bytes": 4900},
+            "session": {"max_message_bytes": max_message_bytes},
+        }
+    )
+
 
 ROBOT = RobotId("default", "robot-1")
 
@@ -67,3 +82,11 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     assert (refused.id, refused.code) == (1, "quota")
     assert isinstance(stored, Result)
     assert [info.name for info in store.list("objects/")] == [object_name(ROBOT, stored.object)]
+
+
+def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):
+    settings = of(f"dir:{tmp_path}")
+
+    assert store_reply(["done", 5.0, bytes(5000)], REQUEST, settings)[:2] == ["failed", "too-large"]
+    assert store_reply(["done", 5.0, bytes(4101)], REQUEST, settings)[:2] == ["failed", "quota"]
+    assert list(DirectoryStore(tmp_path).list()) == []

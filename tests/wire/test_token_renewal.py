@@ -81,6 +81,13 @@ def test_a_renewal_is_due_after_four_fifths_of_the_ttl_and_then_more_often():
     assert min(b - a for a, b in itertools.pairwise(asked)) >= RENEWAL_PAUSE_S
 
 
+def test_after_a_renewal_the_next_one_is_due_in_the_new_ttl():
+    session, connection = linked(100.0)
+    session.receive(connection, CODEC.encode(Renewed(token_s=1000.0)), 80.0)
+
+    assert asked_at(session, connection, 1080)[:2] == [880, 980]
+
+
 @pytest.mark.parametrize("absurd", [-1.0, 1e12])
 def test_an_implausible_expiry_counts_as_one_hour(absurd: float):
     timer = RenewalTimer()

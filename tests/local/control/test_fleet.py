@@ -129,6 +129,16 @@ async def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -
     assert world.fleet.dead == {}
 
 
+async def test_the_one_with_the_fewest_robots_is_drained_and_the_last_one_never() -> None:
+    async with a_fleet() as world:
+        for member, robots in zip(await world.up(3), (5, 2, 9), strict=True):
+            member.robots = robots
+        assert world.fleet.shrink("idle") == "server-2"
+        assert world.balancer.targets[-1] == ["server-1", "server-3"]
+        assert world.fleet.shrink("idle") == "server-1"
+        assert world.fleet.shrink("idle") is None
+
+
 async def test_a_start_that_fails_is_a_young_death_and_an_event() -> None:
     async with a_fleet() as world:
         world.servers.broken.add("server-1")

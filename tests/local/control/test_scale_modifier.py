@@ -95,6 +95,19 @@ def test_missing_servers_are_launched_at_once_but_not_while_somebody_else_change
     assert servers.asked == [("grow", 1)]
 
 
+def test_the_scheduled_minimum_holds_from_its_minute_on() -> None:
+    modifier, servers, _ = made(ServerHealth(servers=2, healthy=2), minimum=lambda: scheduled)
+    scheduled = 2
+    modifier.act([], now_s=61.0, period_over=False)
+    assert servers.asked == []
+
+    scheduled = 4
+    modifier.act([], now_s=62.0, period_over=False)
+
+    assert servers.asked == [("grow", 2)]
+    assert modifier.document()["min_servers"] == 4
+
+
 def crashes(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, Any]]]:
     """Let each replacement die at once, look once a second, and return when one was started."""
     modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-1": young}))

@@ -97,3 +97,8 @@ def test_a_defect_goes_to_the_log_and_not_to_the_robot(ask: Ask, what: str):
     assert answer.code == "internal"
     assert "secret" not in answer.message
     assert defect
+
+
+def test_a_service_without_memory_ends_the_process(ask: Ask):
+    with pytest.raises(MemoryError):
+        ask({"what": "memory"})

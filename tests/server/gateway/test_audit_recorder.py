@@ -76,6 +76,19 @@ def test_a_refusal_is_recorded_whatever_the_header_holds(header: str):
     assert len(recording.notes) == 1
 
 
+def test_a_flood_of_refusals_is_counted():
+    recording = Recording(refusals=RefusalLimiter(per_s=0.01, burst=10.0))
+
+    for _ in range(3000):
+        recording.recorder.record_verdict(REJECTED, "10.0.0.7", CLAIMED)
+    recording.loop.advance(11.0)
+
+    assert [note["action"] for note in recording.notes] == ["auth.refused"] * 10 + ["auth.refused-many"]
+    assert recording.notes[-1]["detail"] == {"bad-signature-or-claims": 2990}
+    recording.loop.advance(60.0)
+    assert len(recording.notes) == 11, "nothing is counted twice"
+
+
 def test_a_renewal_with_the_same_token_is_not_recorded():
     recording = Recording()
     fresh = Claims(robot=ROBOT, token_id="t-2", issued_s=1.0, expires_s=900.0, key_id="k-1")

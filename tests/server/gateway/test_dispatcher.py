@@ -16,7 +16,7 @@ from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueBacklog, QueuedCommand, QueueReport
 from rse_pf.service import Registry
 from rse_pf.storage.object_store import MemoryStore, digest_of
-from rse_pf.wire import Command, Failure, Ping, Pong, Result, Welcome
+from rse_pf.wire import Command, Failure, Move, Ping, Pong, Result, Welcome
 from tests.kit.admitted_commands import measure_turns, queued
 from tests.kit.fakes import FakeLoop, FakeWire
 from tests.kit.worker_parts import BINARY, WorkerParts, worker_parts
@@ -104,6 +104,25 @@ def test_a_named_object_is_read_by_a_thread_and_a_large_reply_is_stored_in_turn(
     reply = msgspec.msgpack.decode(get(object_name(RobotId("default", "r"), result.object)), type=Large)
     assert reply.data == data
     assert threads == {"solver-0"}, "the event loop never waits for the store"
+
+
+def test_a_kind_of_service_that_this_server_does_not_run_is_refused(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    worker.say(connection, Command(id=3, service="kept", payload={}))
+
+    assert wire.sent[-1].code == "unknown-service"
+    assert worker.dispatcher.held == 0
+
+
+def test_nothing_is_written_behind_a_close(worker: WorkerParts):
+    connection, wire = worker.join()
+    connection.close(1001, "leaving")
+
+    connection.write(worker.codec.encode(Move(reason="drain", within_ms=1.0)))
+    worker.say(connection, Ping(sent_s=1.0))
+
+    assert [type(m) for m in wire.sent] == [Welcome]
 
 
 def overload(worker: WorkerParts) -> QueuedCommand:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -45,3 +46,13 @@ def test_the_most_loaded_worker_asks_its_robots_first() -> None:
     delays = plan([10, 30], 20, spread_s=1.0, moves_per_s=1000.0, random=lambda: 0.0)
 
     assert [len(each) for each in delays] == [0, 20]
+
+
+def test_a_robot_that_came_back_may_be_asked_again_once_its_time_is_over() -> None:
+    loop, connections = FakeLoop(50.0), [Connection()]
+    moves = migration(connections, loop)
+
+    moves.begin([0.0, 0.9, 1.1], within_ms=1000.0)
+    loop.advance(10.0)
+
+    assert [now for _, _, now in connections[0].asks] == pytest.approx([50.0, 51.1])

@@ -172,6 +172,16 @@ def test_a_result_that_arrives_before_the_cancel_is_processed_is_kept(bench):
     assert code(bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))) == "ok"
 
 
+def test_the_failure_of_a_followed_job_is_reported_and_not_retried(bench):
+    owner = another(bench)
+    owner.take()
+    failed = JobRecord(state="failed", owner="", code="crashed", message="it ended")
+    bench.on_tell = lambda share, what: owner.end(failed)
+
+    assert code(bench.run()) == "crashed"
+    assert bench.processes == []
+
+
 def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owner(bench):
     def overtake(share: float, what: str) -> None:
         if what == "half" and bench.record.owner == "us":

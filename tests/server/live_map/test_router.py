@@ -216,6 +216,18 @@ async def test_a_map_begins_with_another_one_for_who_may_read_that(
         assert allowed or (isinstance(answer, Failure) and "maps:read/secret" in answer.message)
 
 
+async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
+    async with a_router() as parts:
+        parts.client.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}
+        connection = FakeReader()
+        connection.claims = claims("maps:live/b")
+
+        answer = await parts.ask("live-list", None, connection=connection)
+
+        assert isinstance(answer, Result)
+        assert answer.reply == {"maps": [{"name": "b"}]}
+
+
 async def test_a_map_server_that_does_not_answer_is_given_up_at_the_deadline() -> None:
     async with a_router() as parts:
         parts.client.answer = lambda operation, payload: None
@@ -237,6 +249,21 @@ async def test_while_the_map_server_changes_a_robot_gets_the_time_to_ask_again()
 
         assert isinstance(answer, Failure)
         assert (answer.code, answer.retry_after_ms) == ("busy", 300.0)
+
+
+async def test_a_defect_is_an_internal_failure_without_its_text() -> None:
+    async with a_router() as parts:
+
+        def broken(operation: str, payload: dict[str, Any]) -> dict[str, Any]:
+            raise ZeroDivisionError("secret")
+
+        parts.client.answer = broken
+
+        answer = await parts.ask("live-show", {"map": "m"})
+
+        assert isinstance(answer, Failure)
+        assert answer.code == "internal"
+        assert "secret" not in answer.message + answer.hint
 
 
 async def test_more_bytes_than_one_worker_holds_are_busy() -> None:

@@ -89,6 +89,18 @@ def test_the_deadlines_of_robots_are_evidence_neither_against_a_service_nor_agai
     assert {block.reason for block in breaker.blocks(600.0)} == {"overruns"}
 
 
+def test_a_robot_whose_deadline_is_overrun_again_and_again_is_refused_the_service_and_told_why():
+    breaker = CircuitBreaker(SETTINGS)
+    for i in range(3):
+        breaker.note_overrun(ONE, "icp", float(i))
+
+    assert refused(breaker, ONE, TWO, NAMESAKE, now=3.0) == ["worker-lost", "", ""]
+    refusal = breaker.refusal(ONE, "icp", "a", 3.0)
+    assert refusal is not None
+    assert "longer deadline" in refusal.hint
+    assert refused(breaker, ONE, now=62.1) == [""]
+
+
 # --- several robots, several tenants ---------------------------------------------------------------
 
 

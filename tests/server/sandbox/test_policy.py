@@ -9,9 +9,11 @@ from rse_pf.errors import BadRequest, RsePfError, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.server.sandbox.circuit_breaker import POISON_CRASHES, CircuitBreaker
 from rse_pf.server.sandbox.policy import (
+    START_TIMEOUT_S,
     Action,
     AnswerCall,
     CreateSandbox,
+    KillSandbox,
     LoadSnapshot,
     LogEnd,
     ReleaseSandbox,
@@ -197,6 +199,33 @@ def test_a_command_that_waited_beyond_its_deadline_costs_no_compute():
 
     assert outcomes(actions) == [(running, "ok"), (late, "expired")]
     assert not any(isinstance(each, SendMessage) for each in actions)
+
+
+def test_a_sandbox_that_does_not_start_in_time_is_killed():
+    policy, call = make_policy(), make_call()
+    policy.submit(call, 0.0)
+    assert policy.wake_s == START_TIMEOUT_S
+
+    assert policy.tick(START_TIMEOUT_S) == [KillSandbox(1)]
+    actions = policy.on_exit(1, "signal SIGKILL", START_TIMEOUT_S)
+
+    assert outcomes(actions) == [(call, "worker-lost")]
+    assert LogEnd(A, "", "it did not start in time (signal SIGKILL)", True) in actions
+
+
+def test_a_sandbox_that_violates_the_protocol_is_killed():
+    policy = make_policy()
+    start(policy, make_call())
+    assert policy.on_violation(1, "it sent an invalid message") == [KillSandbox(1)]
+
+    policy = make_policy()
+    start(policy, make_call())
+    policy.on_reply(1, OK, 1.0)
+    assert policy.on_reply(1, OK, 1.0) == [KillSandbox(1)], "a reply that nobody asked for"
+
+    policy = make_policy()
+    start(policy, make_call())
+    assert policy.on_ready(1, 1.0) == [KillSandbox(1)], "ready for the second time"
 
 
 # --- connections, grace and capacity ---------------------------------------------------------------

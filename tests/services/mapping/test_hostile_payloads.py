@@ -212,3 +212,18 @@ def test_a_map_that_was_merged_often_stays_readable() -> None:
     after = decode_map(encode_map(merged)).provenance
     assert after["parents"] == [{"robot": "robot-1"}] * 2
     assert len(after["from"]) == len(merged.keyframes)
+
+
+@pytest.mark.parametrize("payload", [cloud(source=[1e7 + each for each in ROOM]), cloud(target=[1e12] * 300)])
+def test_clouds_beyond_the_voxels_of_the_solver_are_refused_before_it_is_asked(payload: Any) -> None:
+    answer = asked("icp", payload)
+
+    assert isinstance(answer, Failure)
+    assert "500000 voxels" in answer.message
+
+
+def test_merging_refuses_more_pairs_than_can_be_tried() -> None:
+    answer = asked("merge", {"maps": [MAP] * 64, "options": {"candidates": 100}})
+
+    assert isinstance(answer, Failure)
+    assert answer.code == LimitExceeded.code

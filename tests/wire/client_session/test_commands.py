@@ -270,6 +270,15 @@ def test_time_in_which_the_robot_did_not_run_is_no_stall_of_the_server():
     assert session.check(connection, 5.0) == []
 
 
+def test_a_connection_without_a_welcome_is_lost():
+    session = make_session()
+    connection = session.open_connection(0.0)
+
+    now, events = tend_until_lost(session, connection)
+    assert events == [ConnectionLost("no welcome")]
+    assert now <= SETTINGS.hello_timeout_s + SETTINGS.stall_timeout_s
+
+
 def test_pings_measure_the_offset_and_results_the_two_delays():
     session = make_session()
     connection = open_connection(session)

@@ -207,6 +207,12 @@ def test_strangers_get_the_same_bytes_whatever_the_state_of_the_robot_is(cause, 
     assert refused.answer == UNTOLD
 
 
+def test_without_keys_robots_are_anonymous_and_never_expire():
+    assert judge(HandshakePolicy(SETTINGS, None)) == Accepted(
+        robot=RobotId("default", "anonymous-1"), codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=None
+    )
+
+
 def test_the_health_page_has_one_answer_also_when_the_server_is_full():
     answers = [
         judge(path=b"/healthz", authorization=each, is_full=full) for each in ("", "x") for full in (0, 1)

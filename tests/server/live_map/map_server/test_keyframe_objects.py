@@ -261,3 +261,22 @@ async def test_the_next_map_server_deletes_objects_that_the_last_one_could_not()
     await settle()
 
     assert not list(store.list(f"objects/{ONE.folder}/"))
+
+
+def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
+    from rse_pf.live_map.events import KeyframeAdded, RobotForgotten
+    from rse_pf.live_map.live_map import LiveMap
+
+    live_map = LiveMap()
+    for robot in (ONE, OTHER):
+        reference = ObjectReference(hashlib.sha256(robot.name.encode()).hexdigest(), 10)
+        request = msgspec.msgpack.decode(keyframe_request(0, reference), type=KeyframeRequest)
+        live_map.apply(KeyframeAdded(robot=robot.folder, segment=0, number=0, data=request.keyframe))
+    live_map.apply(RobotForgotten(robot=ONE.folder))
+    parts = live_map.snapshot_parts()
+
+    restored = LiveMap.restore_parts(parts.head, lambda name: parts.parts[name] or b"")
+
+    assert [robot for robot, _ in restored.deletable_objects] == [ONE.folder]
+    assert restored.objects_of([1]) == live_map.objects_of([1]) != []
+    assert restored.digest() == live_map.digest()
