@@ -57,6 +57,7 @@ from rse_pf.cli.access.adopt import AdoptRequest, run_adopt
 from rse_pf.cli.access.enrolment import EnrolRequest, enrolment_lines, make_enrolment
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
+from rse_pf.enrolment import Enrolment
 from rse_pf.errors import UsageError
 from rse_pf.terminal import format_time, show, show_json
 
@@ -131,11 +132,16 @@ def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
         raise UsageError("--url and --authority are for enrol --out", hint="see rse-pf robot enrol --help")
     access = request.open_access_control(settings)
     tenant = tenant_or_default(request.tenant)
-    enrolment = None if request.out is None else make_enrolment(request, tenant, settings)
+    enrolment: Enrolment | None = None
+    if request.public_key is None:
+        enrolment = make_enrolment(request, tenant, settings)
+        public_key = str(enrolment.key["x"])
+    else:
+        public_key = _public_key(request.public_key)
     robot = EnrolledRobot(
         robot=request.robot,
         tenant=tenant,
-        x=_public_key(request.public_key) if enrolment is None else str(enrolment.key["x"]),
+        x=public_key,
         scopes=check_scopes(tuple(request.scope)),
         quotas=read_quotas(request.quota),
         enrolled_s=round(time.time(), 3),
@@ -227,9 +233,9 @@ def enable(request: RobotRequest, settings: PlatformSettings) -> None:
     show(f"{described(robot, tenant)} is enabled again, for tokens issued since {format_time(from_s)}")
 
 
-def _public_key(path: Path | None) -> str:
+def _public_key(path: Path) -> str:
     try:
-        text = sys.stdin.read() if path is None or str(path) == "-" else path.read_text(encoding="utf-8")
+        text = sys.stdin.read() if str(path) == "-" else path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(
             f"cannot read {path}", hint="name the file with the public key that keygen printed"
