@@ -79,17 +79,6 @@ say({ gap, dials: dials.length, back_s: seconds() - from });
     assert told["back_s"] < told["gap"], "it did not wait for its next attempt"
 
 
-def test_in_node_an_attempt_whose_question_times_out_reached_nobody() -> None:
-    told = told_by("""
-globalThis.fetch = async () => { throw new DOMException("late", "TimeoutError"); };
-await lose(failAtOnce);
-await nextDial(5);
-say({ second: await nextDial(5) });
-""")
-
-    assert told["second"] >= 0.95, told
-
-
 def test_an_attempt_that_reached_nobody_ends_the_time_for_which_a_server_is_spared() -> None:
     """A robot whose network went twice within seconds waited as if a server had refused it all the while."""
     told = told_by("""

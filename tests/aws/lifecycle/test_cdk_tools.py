@@ -36,17 +36,3 @@ def test_the_cdk_gets_one_stack_the_region_and_the_qualifier(checkout: Path) -> 
 def test_the_qualifier_of_the_cdk_has_the_stack_of_the_cdk_and_any_other_one_of_its_own() -> None:
     assert resource_names.toolkit_stack("hnb659fds") == "CDKToolkit"
     assert resource_names.toolkit_stack("lab1") == "CDKToolkit-lab1"
-
-
-def test_the_file_of_settings_reaches_the_synthesis(
-    checkout: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("aws_cdk", reason="run make setup")
-    from app import settings_file
-
-    monkeypatch.chdir(tmp_path)
-    CdkTools(checkout, SETTINGS, "1", Path("lab.json")).deploy("RsePf-lab-Data")
-
-    name, _, value = (checkout / "called").read_text().split()[-1].partition("=")
-    assert settings_file({name: value}, repository) == tmp_path / "lab.json"
-    assert settings_file({}, repository) == repository / "cdk.json"

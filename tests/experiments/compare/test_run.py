@@ -4,37 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from client_sdk.trajectory import Trajectory, read_trajectory
+from client_sdk.trajectory import read_trajectory
 from rse_pf.config import PlatformSettings
-from rse_pf.extensions.experiments.compare import evo_figures, run
+from rse_pf.extensions.experiments.compare import run
 from rse_pf.extensions.experiments.compare.configurations import configurations_of
-from rse_pf.extensions.experiments.compare.evo_figures import evo_ate_cm, evo_command
 from rse_pf.extensions.experiments.compare.report import row_of, runs_line, table_lines
 from rse_pf.extensions.experiments.compare.run import CompareOptions, run_compare
 from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 from rse_pf.extensions.experiments.compare.tracking_run import track
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
-from rse_pf.geometry import exp_se3
 from tests.kit.compare_recordings import black, flat_drive
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 image = pytest.importorskip("PIL.Image")
 
 SETTINGS = PlatformSettings()
-FAKE_EVO = """#!{python}
-import sys
-assert sys.argv[1] == "tum" and "--align" in sys.argv, sys.argv
-poses = [len([line for line in open(path) if line[0] != "#"]) for path in sys.argv[2:4]]
-assert poses[0] == poses[1] > 0, poses
-print("APE w.r.t. translation part (m)\\n\\n      mean\\t1.0\\n      rmse\\t0.012345\\n       std\\t0.1")
-"""
 
 
 def compare(folder: Path, *words: str, runs: int = 1, **drive: Any) -> dict[str, Any]:
@@ -115,37 +103,3 @@ def test_a_recording_without_truth_is_said_in_one_line(
     assert "ATE cm" not in told
     assert report["rows"][0]["figures"]["posed"] == [10, 10]
     assert (tmp_path / "compare.png").stat().st_size > 0
-
-
-def test_evo_stands_beside_ours_where_its_command_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = tmp_path / "bin" / "evo_ape"
-    command.parent.mkdir()
-    command.write_text(FAKE_EVO.format(python=sys.executable))
-    command.chmod(0o755)
-    monkeypatch.setenv("PATH", str(command.parent))
-    monkeypatch.setattr(evo_figures.sys, "executable", str(tmp_path / "python"))
-    monkeypatch.setattr(run, "evo_command", evo_command)
-
-    report = compare(tmp_path / "out", "default")
-
-    assert report["rows"][0]["figures"]["evo_ate_cm"] == [1.2345, 1.2345]
-    assert "evo cm" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("with_scale", [False, True])
-def test_evo_itself_agrees_with_us(with_scale: bool) -> None:
-    command = evo_command()
-    if command is None:
-        pytest.skip("evo_ape is not on the path: pip install evo, in any environment")
-    rng = np.random.default_rng(4)
-    poses = [np.eye(4)]
-    for _ in range(49):
-        poses.append(poses[-1] @ exp_se3(rng.normal(0.0, 0.1, 6)))
-    truth = Trajectory(1e9 + np.arange(50) / 10, np.array(poses))
-    estimate = Trajectory(truth.timestamps_s, np.array(poses))
-    estimate.T_world_camera[:, :3, 3] = 1.3 * estimate.positions + rng.normal(0.0, 0.05, (50, 3))
-    errors = accuracy(estimate, truth, with_scale=with_scale)
-
-    assert evo_ate_cm(command, errors) == pytest.approx(100 * errors.ate_m, abs=1e-3)

@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
-
-from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.records import (
     SampleLog,
-    read_commands,
     read_samples,
     run_sample,
     sample_from_document,
 )
 
 ORIGIN_S = 1000.0
-
-
-def test_a_malformed_file_is_one_line_with_a_hint(tmp_path):
-    (tmp_path / "commands.csv").write_text("id,robot\nx,y\n")
-    with pytest.raises(UsageError, match="cannot read"):
-        read_commands(tmp_path / "commands.csv")
-    with pytest.raises(UsageError, match="cannot read"):
-        read_commands(tmp_path / "nothing.csv")
 
 
 def test_samples_of_the_monitor_are_read_back_as_they_were_written(tmp_path):
