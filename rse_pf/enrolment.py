@@ -92,9 +92,9 @@ class EnrolmentFile:
         return Enrolment.read(self._path)
 
     def fresh_token(self) -> str:
-        """Return a fresh token; raises UsageError if the file holds no enrolment."""
+        """Return a new token, signed with the robot's key; raises UsageError if file or key is invalid."""
         return self.read().token(now_s=self._clock(), token_id=secrets.token_hex(_ID_BYTES))
 
     async def token(self) -> str:
-        """Return a fresh token, for `client_sdk.connect`; raises UsageError like `fresh_token`."""
+        """Return what `fresh_token` returns, as the coroutine function that `client_sdk.connect` takes."""
         return self.fresh_token()

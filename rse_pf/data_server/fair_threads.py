@@ -58,7 +58,10 @@ def while_wanted(items: Iterable[_T]) -> Iterator[_T]:
 
 
 class FairThreads:
-    """A pool of threads, which start when they are needed; `close` ends it."""
+    """A pool of threads, started when they are needed, for the work of robots in the order of `FairQueue`.
+
+    `close` waits for running work and drops the rest.
+    """
 
     def __init__(self, threads: int = _THREADS) -> None:
         self._most = threads

@@ -190,7 +190,8 @@ def inflate_short(data: bytes, budget: Budget, library: ModuleType) -> bytes:
     max_bytes = min(budget.inflated_bytes, max(plain_bytes, int(len(data) * budget.inflate_ratio)))
     text, stream = _inflated(data, plain_bytes + 1, library)
     if len(text) > plain_bytes:
-        # The ratio limits large results only: a bomb reaches the plain size with its first bytes.
+        # Up to plain_bytes any ratio is allowed.  A bomb inflates to more than that from its first bytes, so
+        # the ratio is that of the bytes used so far, without those that follow.
         used_bytes = len(data) - len(stream.unconsumed_tail)
         if used_bytes * budget.inflate_ratio <= plain_bytes:
             raise _bomb_error(len(data), plain_bytes)

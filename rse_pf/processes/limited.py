@@ -503,7 +503,10 @@ def _silence_libraries() -> None:
 
 
 def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
-    """Answer one call; return False at the end of the connection."""
+    """Answer one call; return False at the end of the connection.
+
+    A call that uses more than *cpu_s* of CPU time ends this process.
+    """
     header = connection.recv(_LENGTH.size, socket.MSG_WAITALL)
     if len(header) < _LENGTH.size:
         return False

@@ -33,7 +33,7 @@ class Wire(Protocol):
         """Return how many bytes wait in this process, because the kernel does not take more."""
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Limit the bytes that the kernel holds for the network to *max_bytes*."""
+        """Limit the bytes of this connection that the kernel holds and has not sent to *max_bytes*."""
 
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
@@ -202,7 +202,7 @@ class Subscriber(Protocol):
         """Bytes that were written and that the kernel has not taken."""
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Limit the bytes that the kernel holds for the network to *max_bytes*."""
+        """Limit the bytes of this connection that the kernel holds and has not sent to *max_bytes*."""
 
     def write(self, data: bytes) -> None:
         """Write one message."""

@@ -76,7 +76,11 @@ class Lease(Generic[R]):
 
     @property
     def unchanged_s(self) -> float:
-        """For how long this process has known the record unchanged, in seconds."""
+        """Seconds since this process last noticed a change of the record, by a read, a write or `note_beat`.
+
+        They also increase while the record is not read.  Before the first change they count from the creation
+        of this object.
+        """
         return self._clock() - self._changed_s
 
     @property

@@ -106,5 +106,8 @@ def is_long_outage(submitted_s: float, deadline_s: float, now_s: float) -> bool:
 
 
 def send_order(identity: int, stream: str) -> tuple[bool, int]:
-    """Return the sort key of a waiting command: without a stream oldest first, then frames newest first."""
+    """Return the sort key of a command that waits after a long outage.
+
+    Commands without a stream come first, the oldest first; then frames, the newest first.
+    """
     return (True, -identity) if stream else (False, identity)

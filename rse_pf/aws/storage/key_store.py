@@ -102,7 +102,7 @@ class KeyRing:
 
 
 class KeyStore:
-    """The secret and the bucket of one deployment."""
+    """The secret that holds the signing keys of one deployment, and the bucket with their public keys."""
 
     def __init__(self, account: Account, *, secret: str, bucket: str) -> None:
         self._account = account

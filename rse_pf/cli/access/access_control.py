@@ -42,7 +42,7 @@ class PlatformRequest:
 
     @property
     def folder(self) -> Path:
-        """The folder of the state of the local platform; raises UsageError for a name that is none."""
+        """State folder of the local platform, which need not exist; raises UsageError for an invalid name."""
         return state_folder(self.name, os.environ)
 
     @property

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 __all__ = ["ACTION", "DEFAULT_NAME", "PlatformRequest"]
 
 DEFAULT_NAME = "default"
-# Port on loopback of the burst function, unless --burst names another one.
+# Port on loopback of the burst function if --burst is given without a port.
 _BURST_PORT = 8702
 _LINES = 100
 _FOLLOW_S = 0.2
@@ -85,7 +85,7 @@ class PlatformRequest:
 
     @property
     def folder(self) -> Path:
-        """The folder of the state of the platform; raises UsageError for a name that is none."""
+        """State folder of the platform, which need not exist; raises UsageError for an invalid name."""
         from rse_pf.local.state import state_folder
 
         return state_folder(self.name, os.environ)

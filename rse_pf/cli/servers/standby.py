@@ -24,7 +24,7 @@ _MODULES = (
 )  # fmt: skip
 """In the order of their imports, so that the thread can stop between any two of them."""
 _NICENESS = 3
-"""Of the thread: with one busy process on each core, it gets about a third of a core."""
+"""Of the thread that imports `_MODULES`: with one busy process on each core, it gets a third of a core."""
 
 
 def main() -> int:

@@ -18,7 +18,7 @@ __all__ = ["PlatformAudit"]
 
 
 class PlatformAudit:
-    """The log of one control plane, between `open` and `close`."""
+    """Records events of one control plane in its audit log; drops those before `open` and after `close`."""
 
     def __init__(self, state: Path, *, on_problem: Callable[[str], None]) -> None:
         """Open nothing yet; *on_problem* is called as `AuditLog` says."""

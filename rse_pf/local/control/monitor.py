@@ -66,7 +66,11 @@ class ServerSample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MonitorSample:
-    """All servers at one time.  ``cpu_percent`` is the mean over servers past their warm-up, or None."""
+    """All servers at one time.
+
+    ``cpu_percent`` is the mean over the servers past their warm-up, None if there are none; 100 is all the
+    CPU time that a server may use (`capacity_cores`).
+    """
 
     time: float
     cpu_percent: float | None

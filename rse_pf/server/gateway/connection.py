@@ -156,7 +156,7 @@ class RobotConnection:
         return self._wire.unsent_bytes()
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Limit the bytes that the kernel holds for the network to *max_bytes*."""
+        """Limit the bytes of this connection that the kernel holds and has not sent to *max_bytes*."""
         self._wire.bound_unsent(max_bytes)
 
     def refuse_updates(self, identity: int, error: RsePfError) -> None:
@@ -190,7 +190,7 @@ class RobotConnection:
         self._wire.pause(seconds)
 
     def hold_until_answered(self, command_id: int) -> None:
-        """Read nothing more from the robot until a command is answered."""
+        """Read nothing more until the command *command_id* is answered; messages that were read wait, too."""
         self._awaited_id = command_id
         if self._deferred is None:
             self.defer()

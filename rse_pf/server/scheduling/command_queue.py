@@ -80,7 +80,8 @@ class QueueReport:
 
     Attributes:
         gauges: Values for ``/metrics``, by the name of the metric.
-        cpu_s: CPU seconds by kind of work and by tenant, of work in other processes.
+        cpu_s: CPU seconds since the start of the worker, by kind of work, then by tenant, of work in other
+            processes; for sandboxes the elapsed time of their requests.
         sections: Further parts of the worker's report, by their names.
     """
 
@@ -115,7 +116,7 @@ class CommandQueue(Protocol):
         """Forget the connection *owner*, which ended; return its commands that are dropped."""
 
     def report(self) -> QueueReport:
-        """Return the present metrics."""
+        """Return the present metrics; none is reset."""
 
     def enter(self, owner: Any) -> None:
         """Note the connection *owner*, whose handshake is done."""

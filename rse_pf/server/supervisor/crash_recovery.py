@@ -40,7 +40,7 @@ def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
 
 
 class CrashRecovery:
-    """Counts the crashes of the workers of one server, and holds its spare processes."""
+    """Replaces a server's crashed workers by spare processes; refuses robots whose commands crash workers."""
 
     def __init__(
         self,
