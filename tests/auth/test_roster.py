@@ -107,6 +107,15 @@ def test_a_denial_applies_to_its_own_robot_and_tenant_only(denied: DenyList):
     assert verified(token(), trusted(denied)).robot == ENROLLED.id
 
 
+def test_enabling_a_robot_enables_no_robot_of_that_name_in_another_tenant():
+    both = DenyList().with_robot("lab", "robot-1", 0.0).with_robot("other", "robot-1", 0.0)
+
+    denied = both.without_robot("other", "robot-1")
+
+    assert problem(token(), trusted(denied)) == "disabled"
+    assert not denied.is_disabled("other", "robot-1")
+
+
 def test_a_robot_that_is_removed_or_has_a_new_key_loses_its_connections():
     claims = verified(token(), trusted())
     other = EnrolledRobot(robot="robot-2", tenant="lab", x=ENROLLED.x)

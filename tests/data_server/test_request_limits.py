@@ -6,7 +6,7 @@ import pytest
 
 from rse_pf.config import DataSettings
 from rse_pf.data_server.http import HttpRequest, TooManyRequests
-from rse_pf.data_server.request_limits import RequestLimits
+from rse_pf.data_server.request_limits import MAX_REQUESTS_PER_ROBOT, RequestLimits
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 
@@ -72,3 +72,24 @@ def test_the_names_of_robots_that_come_and_go_take_no_memory() -> None:
         ask(gate, RobotId("acme", f"robot-{number}"), now=float(number))
 
     assert gate.known_robots <= 10_001
+
+
+def test_a_robot_has_a_limit_of_requests_in_progress() -> None:
+    gate = admission()
+    first, *_ = [begin(gate, ROBOT) for _ in range(MAX_REQUESTS_PER_ROBOT)]
+
+    with pytest.raises(TooManyRequests, match=f"{MAX_REQUESTS_PER_ROBOT} requests"):
+        begin(gate, ROBOT)
+
+    begin(gate, OTHER)
+    gate.end(first)
+    begin(gate, ROBOT)
+
+
+def test_an_expensive_request_counts_for_several() -> None:
+    gate = admission()
+    for _ in range(2):
+        ask(gate, ROBOT, now=0.0, cost=20.0)
+
+    with pytest.raises(TooManyRequests):
+        ask(gate, ROBOT, now=0.0)

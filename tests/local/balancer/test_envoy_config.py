@@ -115,6 +115,21 @@ def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer(
     ]  # fmt: skip
 
 
+def test_the_address_of_a_robot_is_that_of_its_connection_whatever_its_headers_claim() -> None:
+    made = manager(config())
+
+    assert (made["use_remote_address"], made["xff_num_trusted_hops"]) == (True, 0)
+
+
+def test_headers_are_bounded_in_number_size_and_time() -> None:
+    made = manager(config(session={"hello_timeout_s": 1.5}))
+
+    assert made["request_headers_timeout"] == "1.5s"
+    assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"
+    assert made["max_request_headers_kb"] == 8
+    assert made["common_http_protocol_options"]["max_headers_count"] <= 100
+
+
 def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
     made = config(session={"ping_interval_s": 2.0, "ping_timeout_s": 1.0})
     options = {(each["level"], each["name"]): each["int_value"] for each in listener(made)["socket_options"]}
