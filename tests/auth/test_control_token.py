@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.auth.control_token import ensure_control_token, read_control_token
+from rse_pf.auth.control_token import bearer, carries_token, ensure_control_token, read_control_token
 from rse_pf.errors import UsageError
 
 TOKEN = "0123456789abcdef" * 4
@@ -54,3 +54,19 @@ def test_a_file_without_a_valid_secret_is_refused_in_one_line(
     assert caught.value.hint
     assert "\n" not in caught.value.message
     assert TOKEN[:31] not in caught.value.report()
+
+
+@pytest.mark.parametrize("header", [bearer(TOKEN), f"bearer {TOKEN}"])
+def test_a_header_with_the_token_is_accepted(header: str) -> None:
+    assert carries_token(header, TOKEN)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "", "Bearer", "Bearer ", TOKEN, f"Basic {TOKEN}", f"Bearer {TOKEN[:-1]}", f"Bearer {TOKEN}0",
+        f"Bearer {TOKEN.upper()}", f"Bearer  {TOKEN}", f"Bearer {TOKEN} {TOKEN}", f"Bearer {TOKEN[:-1]}\xe9",
+    ],
+)  # fmt: skip
+def test_any_other_header_is_rejected(header: str) -> None:
+    assert not carries_token(header, TOKEN)

@@ -90,3 +90,15 @@ async def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_st
     assert await asyncio.wait_for(threads.run(OTHER, int, "1"), TIMEOUT_S) == 1
     threads.close()
     assert steps == [0]
+
+
+async def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads) -> None:
+    gate = Gate()
+
+    robots = [RobotId("acme", f"robot-{number % 12}") for number in range(96)]
+    flood = [asyncio.ensure_future(threads.run(robot, gate.work)) for robot in robots]
+    one = [asyncio.ensure_future(threads.run(OTHER, gate.work)) for _ in range(8)]
+    await gate.wait_entered(7)
+    assert not gate.entered.acquire(blocking=False), "of eight, six for the tenant, one for the other"
+    gate.open.set()
+    assert await asyncio.wait_for(asyncio.gather(*flood, *one), TIMEOUT_S) == ["done"] * 104

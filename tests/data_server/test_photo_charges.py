@@ -79,3 +79,15 @@ def test_a_photo_that_fails_is_charged_for_what_it_took() -> None:
         localiser.outline(ROBOT, "hall", charged.append)
 
     assert charged == [0.3]
+
+
+def test_a_photo_never_counts_for_more_than_what_may_come_at_once() -> None:
+    localiser = Localiser()
+    service = PhotoService(small_settings(max_requests_per_s=50), MemoryStore(), localiser=localiser)
+    localiser.cpu_s = 20.0  # the first photo of a large map
+
+    assert service.photo().status == 200
+    service.now += 0.1
+    assert service.photo().status == 200
+    refused = service.photo()
+    assert int(refused.headers["retry-after"]) <= 5
