@@ -195,3 +195,10 @@ def test_an_action_that_could_not_be_recorded_is_an_error(
 
     with pytest.raises(ConfigurationError, match="No space left on device"):
         record_many()
+
+
+def test_files_are_private(tmp_path: Path):
+    write(tmp_path / "audit", range(1))
+
+    assert (tmp_path / "audit").stat().st_mode & 0o777 == 0o700
+    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "audit").iterdir()} == {0o600}

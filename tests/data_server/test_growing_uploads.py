@@ -110,3 +110,31 @@ def test_only_one_writer_extends_a_file_and_nobody_after_it_became_an_object(sto
     with pytest.raises(NotFound):
         store.adopt("objects/b", "uploads/a", 3)
     assert store.get("objects/a") == b"abc"
+
+
+def test_the_digest_is_checked_over_bytes_that_another_server_wrote(
+    service: Service, store: DirectoryStore
+) -> None:
+    part(service, 0, 4096)
+    store.append(PART, 4096, b"x" * 4096)  # by another server; this one knows a hash of the first part
+
+    assert part(service, 8192, 10_000).status == 400
+    assert list(store.list("objects/")) == list(store.list("uploads/")) == []
+
+
+def test_an_upload_that_another_server_completed_before_it_was_killed_becomes_an_object(
+    service: Service, store: DirectoryStore
+) -> None:
+    part(service, 0, 4096)
+    store.append(PART, 4096, DATA[4096:])  # by another server, which was then killed
+
+    assert service.ask("HEAD", UPLOAD).headers["upload-offset"] == "10000"
+    assert service.ask("GET", OBJECT).body == DATA
+
+
+def test_parts_of_an_earlier_version_are_assembled(service: Service, store: DirectoryStore) -> None:
+    store.put(PART, DATA[:4096])
+    store.put(PART.replace(f"{0:015d}", f"{4096:015d}"), DATA[4096:8192])
+
+    assert part(service, 8192, 10_000).status == 201
+    assert service.ask("GET", OBJECT).body == DATA

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rse_pf.identity import RobotId
-from rse_pf.limits.crash_record import BLOCK_S, CrashRecord
+from rse_pf.limits.crash_record import BLOCK_S, WINDOW_S, CrashRecord
 
 ALICE, NAMESAKE = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 
@@ -28,3 +28,9 @@ def test_after_its_rest_a_robot_needs_as_many_crashes_again():
     assert not record.note_crash(ALICE, BLOCK_S)
     assert record.refusal(ALICE, BLOCK_S) is None
     assert record.note_crash(ALICE, BLOCK_S)
+
+
+def test_crashes_that_lie_far_apart_do_not_count_together():
+    record = CrashRecord()
+
+    assert not any(record.note_crash(ALICE, number * (WINDOW_S + 1.0)) for number in range(5))

@@ -70,6 +70,19 @@ def test_all_processes_together_stay_within_the_quota_of_a_tenant() -> None:
     write(account(store, clock, 20 * MIB, "rival"), store, "objects/rival/r/1", 100_000)
 
 
+def test_a_new_count_keeps_the_bytes_of_writes_in_progress_until_they_must_have_ended(tmp_path: Path) -> None:
+    store, clock = DirectoryStore(tmp_path), Clock()
+    writer, other = account(store, clock, 4 * MIB), account(store, clock, 4 * MIB)
+    writer.reserve(3 * MIB)
+
+    clock.now_s += 11.0  # a folder is counted again after 10 s, and the object may still be written
+    with pytest.raises(QuotaExceeded):
+        other.reserve(2 * MIB)
+
+    clock.now_s += 20.0  # the writer was killed
+    other.reserve(2 * MIB)
+
+
 def test_threads_of_several_processes_stay_within_the_quota() -> None:
     store, clock = MemoryStore(), Clock()
     processes = [account(store, clock, 2 * MIB) for _ in range(3)]
@@ -169,3 +182,20 @@ def test_on_a_disk_that_fills_up_the_tenant_that_fills_it_is_refused_and_others_
     clock.now_s += 60.0
     with pytest.raises(StoreFull):
         filler.reserve(100_000)
+
+
+def test_a_write_that_fails_is_not_charged() -> None:
+    store, clock = MemoryStore(), Clock()
+    accounts = Accounts(store, DataSettings(tenant_quota_bytes=MIB), wall_clock=clock)
+    for _ in range(50):
+        with pytest.raises(StoreFull), accounts.reservation(RobotId("acme", "r"), 500_000):
+            raise StoreFull("no space")
+
+
+def test_a_damaged_account_is_counted_anew() -> None:
+    store, clock = MemoryStore(), Clock()
+    store.put("accounts/acme", b"no account")
+    store.put("objects/acme/r/1", bytes(MIB))
+
+    with pytest.raises(QuotaExceeded):
+        account(store, clock, MIB).reserve(1)
