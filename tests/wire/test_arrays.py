@@ -93,6 +93,12 @@ def test_an_array_is_its_raw_little_endian_bytes(dtype: type[Any], code: int) ->
 
 
 @pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("values", [[-1, 2], [2**32], []])
+def test_integers_beyond_uint32_keep_their_values(codec: str, values: list[int]) -> None:
+    np.testing.assert_array_equal(over_the_wire(np.array(values, dtype=np.int64), codec), values)
+
+
+@pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("values", [np.array(["a"]), np.array([1j]), np.array([True]), np.array([None])])
 def test_an_array_of_anything_but_numbers_cannot_be_encoded(codec: str, values: npt.NDArray[Any]) -> None:
     with pytest.raises(BadMessage):

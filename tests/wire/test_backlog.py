@@ -68,6 +68,17 @@ def test_every_answer_allows_one_more_frame_and_the_newest_is_sent_first():
     assert sent_ids(connection) == [waited[16], waited[15]]
 
 
+def test_a_fresh_frame_is_sent_before_waiting_ones():
+    session, connection, waited = back_with(20)
+    (first,) = sent_ids(connection)
+    (fresh,) = frames(session, 1, now=1.05)
+    assert sent_ids(connection) == []
+
+    answer(session, connection, first, 1.1)
+
+    assert sent_ids(connection) == [fresh, waited[18]]
+
+
 @pytest.mark.parametrize("told", [{"code": "busy"}, {"code": "expired"}, {"queue_ms": 400.0}])
 def test_a_loaded_server_receives_one_frame_at_a_time_again(told):
     session, connection, _ = back_with(20)
@@ -119,6 +130,25 @@ def test_commands_without_a_stream_keep_their_order_and_wait_for_no_frame():
     assert sent_ids(open_connection(session, 1.0)) == [*calls, old[-1]]
 
 
+def test_a_command_without_a_deadline_does_not_hold_frames_back():
+    session = make_session()
+    session.close_connection(open_connection(session))
+    old = old_frames(session, 3)
+    endless = session.submit("map", None, now=0.0, stream="map", keep=True, is_open_ended=True)
+
+    assert sent_ids(open_connection(session, 1.0)) == [endless, old[-1]]
+
+
+def test_a_frame_that_expires_in_flight_allows_the_next_one():
+    session, connection, waited = back_with(4)
+    assert sent_ids(connection) == [waited[3]]
+    (fresh,) = frames(session, 1, now=4.0)
+
+    session.due(5.5)
+
+    assert sent_ids(connection) == [fresh]
+
+
 @pytest.mark.parametrize(("outage_s", "at_once"), [(2.4, 6), (2.6, 1)])
 def test_after_a_short_outage_frames_are_sent_in_their_order(outage_s, at_once):
     """A server that died is replaced by its neighbour within a second or two: the frames are still young."""
@@ -129,6 +159,14 @@ def test_after_a_short_outage_frames_are_sent_in_their_order(outage_s, at_once):
     sent = sent_ids(open_connection(session, outage_s))
 
     assert sent == (waited if at_once > 1 else [waited[-1]])
+
+
+def test_a_move_to_another_server_is_no_outage():
+    session = make_session()
+    open_connection(session)
+    frames(session, ROOM + 4)
+
+    assert len(sent_ids(open_connection(session, 0.1))) == 4
 
 
 def test_frames_are_ordered_newest_first_behind_commands_without_a_stream():

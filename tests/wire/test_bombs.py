@@ -9,6 +9,7 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded
+from rse_pf.wire import Command
 from rse_pf.wire.server_codec import make_server_codec
 
 LIMITS = SessionSettings()
@@ -32,6 +33,14 @@ def test_a_bomb_costs_no_more_memory_than_a_message_may_have():
         tracemalloc.stop()
 
     assert peak < 2 * LIMITS.max_message_bytes + 100_000
+
+
+@pytest.mark.parametrize("size", [1000, 2600, 2622, 20_000, 200_000, 262_000])
+def test_a_text_of_an_allowed_size_is_accepted_at_any_ratio(size):
+    codec = make_server_codec("zlib")
+    message = Command(id=1, service="echo", payload=["x" * (size - 80)])
+
+    assert codec.decode_from_robot(codec.encode(message)) == message
 
 
 def test_more_than_all_that_is_allowed_is_refused_where_it_grows_slowly():

@@ -47,6 +47,25 @@ def test_the_offset_is_never_further_off_than_half_the_shortest_round_trip(ways,
     assert abs(clock.offset_s - offset_s) <= 0.5 * shortest_s + 1e-9
 
 
+def test_the_exchange_that_waited_least_is_believed():
+    clock = ClockOffset()
+
+    for up_s in (0.5, 0.01, 0.9):
+        clock.add(exchange(up_s, 0.01, offset_s=7.0))
+
+    assert clock.offset_s == pytest.approx(7.0)
+
+
+def test_old_exchanges_are_forgotten_so_that_drift_is_followed():
+    clock = ClockOffset(window=4)
+
+    clock.add(exchange(0.001, 0.001, offset_s=0.0))
+    for _ in range(4):
+        clock.add(exchange(0.02, 0.02, offset_s=1.0))
+
+    assert clock.offset_s == pytest.approx(1.0)
+
+
 def test_the_two_delays_tell_a_slow_uplink_from_a_slow_downlink():
     clock = ClockOffset()
     clock.add(exchange(0.01, 0.01, offset_s=5.0))

@@ -172,6 +172,10 @@ def test_of_duplicate_keys_the_last_one_counts() -> None:
     assert payload_of("json", command('{"a":1,"a":2}')) == {"a": 2}
 
 
+def test_unknown_fields_are_ignored_for_compatibility() -> None:
+    assert payload_of("json", command('5,"colour":{"deep":[1]}')) == 5
+
+
 @pytest.mark.parametrize(
     "fields",
     ['"id":-1,"service":"a"', '"id":9007199254740992,"service":"a"', '"id":1.5,"service":"a"',

@@ -57,6 +57,21 @@ def test_a_server_never_receives_more_than_its_rate_limit(bursts, gap_s, delays_
             now = min(until, max(now + 0.001, session.next_due(now)))
 
 
+def test_waiting_commands_are_sent_as_soon_as_the_rate_allows():
+    session = ClientSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=100.0), sdk="t")
+    connection, now, ended = welcomed(session), 0.0, 0
+    for _ in range(90):
+        session.submit("echo", {}, now=now, keep=True)
+    while ended < 90:
+        _, count = answer_all(session, connection, now)
+        ended += count
+        now = max(now + 0.001, session.next_due(now))
+        session.due(now)
+        assert now < 5.0, f"{ended} of 90"
+
+    assert now >= 54 / 18 - 0.1
+
+
 def test_pings_count_towards_the_rate():
     limiter = RateLimiter(Limits(max_message_bytes=4096, max_in_flight=8, **RATE))
     before = limiter.available(0.0)

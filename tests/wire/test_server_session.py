@@ -16,6 +16,7 @@ from rse_pf.wire import (
     FromServer,
     Hello,
     Message,
+    Move,
     Ping,
     Pong,
     Result,
@@ -108,6 +109,23 @@ def test_more_unanswered_commands_than_agreed_are_busy_with_a_time() -> None:
     assert busy.hint
     server_sessions.answer(server, Result(id=1))
     assert isinstance(say(server, Command(id=3, service="echo"))[0], Submit)
+
+
+def test_a_closed_session_ignores_messages() -> None:
+    server = session()
+    say(server, Command(id=1, service="echo", payload=1, trace="t"))
+
+    assert say(server, HELLO) == []
+    assert server_sessions.receive(server, b"nonsense", 1.0) == []
+    assert server.move("drain", 100.0) == []
+
+
+def test_only_an_open_session_is_asked_to_move() -> None:
+    assert session().move("drain", 100.0) == []
+    server = opened()
+    assert [heard(server, each) for each in server.move("drain", 100.0)] == [
+        Move(reason="drain", within_ms=100.0)
+    ]
 
 
 class IpcChannel(RuleBasedStateMachine):

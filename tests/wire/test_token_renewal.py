@@ -88,6 +88,13 @@ def test_after_a_renewal_the_next_one_is_due_in_the_new_ttl():
     assert asked_at(session, connection, 1080)[:2] == [880, 980]
 
 
+def test_a_connection_that_is_being_left_is_not_renewed():
+    session, connection = linked(100.0)
+    connection.leaving = True
+
+    assert asked_at(session, connection, 100) == []
+
+
 @pytest.mark.parametrize("absurd", [-1.0, 1e12])
 def test_an_implausible_expiry_counts_as_one_hour(absurd: float):
     timer = RenewalTimer()

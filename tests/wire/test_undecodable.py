@@ -132,6 +132,15 @@ def test_fields_in_another_order_are_read_up_to_the_first_list(codec: str, names
     assert undecodable_id(make_codec(codec), message) == 7
 
 
+def test_of_a_damaged_stream_the_fields_before_the_damage_count() -> None:
+    whole = zlib.compress(
+        b'{"type":"command","id":7,"service":"echo","payload":"' + bytes(range(32, 127)) * 9
+    )
+
+    assert undecodable_id(make_codec("zlib"), whole[:-4] + b"????") == 7
+    assert undecodable_id(make_codec("zlib"), b"????" + whole) is None
+
+
 @pytest.mark.parametrize("codec", CODECS)
 @given(data=st.binary(max_size=700))
 def test_any_bytes_have_an_id_or_none(codec: str, data: bytes) -> None:
@@ -147,3 +156,14 @@ def test_messages_without_an_id_still_close_the_connection() -> None:
 
     assert [refusal(each).id for each in decisions[:-1]] == [None] * MAX_BAD_MESSAGES
     assert isinstance(decisions[-1][-1], Close)
+
+
+def test_before_hello_no_id_is_read() -> None:
+    server = ServerSession(codec=make_codec("json"), robot="r", server="s", session="x", limits=LIMITS)
+
+    assert (
+        refusal(
+            server_sessions.receive(server, b'{"type":"command","id":7,"service":"x","payload":NaN}', 1.0)
+        ).id
+        is None
+    )

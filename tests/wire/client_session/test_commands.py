@@ -41,6 +41,17 @@ def test_a_connection_begins_with_hello():
     assert hello == Hello(sdk="test", capabilities=("move", "progress", "updates"))
 
 
+def test_a_command_waits_for_a_connection_and_is_sent_with_its_remaining_time():
+    session = make_session()
+    session.submit("pnp", {"x": 1}, now=0.0, deadline_s=1.0)
+
+    connection = open_connection(session, now=0.4)
+
+    (command,) = commands(connection)
+    assert command.deadline_ms == pytest.approx(600.0)
+    assert session.resent == 0
+
+
 def test_an_answer_ends_its_command_once_and_a_duplicate_is_dropped():
     session = make_session()
     connection = open_connection(session)
@@ -100,6 +111,18 @@ def test_an_older_answer_than_the_last_delivered_one_is_stale():
 
     assert codes(tell(session, connection, result(newer), 0.1)) == {newer.id: "ok"}
     assert codes(tell(session, connection, result(older), 0.2)) == {older.id: "stale"}
+
+
+def test_streams_do_not_make_each_other_stale():
+    session = make_session()
+    connection = open_connection(session)
+    for stream in ("left", "left", "right"):
+        session.submit("pnp", None, now=0.0, stream=stream)
+    _, newer, other = commands(connection)
+
+    tell(session, connection, result(newer), 0.1)
+
+    assert codes(tell(session, connection, result(other), 0.2)) == {other.id: "ok"}
 
 
 def test_an_unanswered_command_expires_at_its_deadline_and_not_before():
@@ -236,6 +259,30 @@ def test_a_cancelled_command_is_forgotten_and_never_resent():
     assert commands(open_connection(session, now=1.0)) == []
 
 
+def test_a_command_cancelled_in_flight_is_not_sent_again_when_its_connection_is_lost():
+    session = make_session()
+    connection = open_connection(session)
+    session.cancel(session.submit("pnp", None, now=0.0))
+    commands(connection)
+
+    session.close_connection(connection)
+
+    assert commands(open_connection(session, now=1.0)) == []
+
+
+def test_a_cancelled_command_counts_as_in_flight_until_the_server_answered():
+    session = make_session()
+    connection = open_connection(session, room=1)
+    session.cancel(session.submit("pnp", None, now=0.0))
+    (first,) = commands(connection)
+    session.submit("pnp", None, now=0.0)
+    assert commands(connection) == []
+
+    tell(session, connection, result(first), 0.1)
+
+    assert len(commands(connection)) == 1
+
+
 def test_a_stalled_connection_with_an_unanswered_command_is_lost_in_time():
     session = make_session()
     connection = open_connection(session)
@@ -259,6 +306,30 @@ def test_a_slow_command_is_no_stall_while_the_server_answers_pings():
         for message in sent(connection):
             if isinstance(message, Ping):
                 tell(session, connection, Pong(sent_s=message.sent_s, received_s=now, answered_s=now), now)
+
+
+def test_a_command_after_a_long_idle_time_does_not_end_its_connection():
+    session = make_session()
+    connection = open_connection(session)
+    session.check(connection, 0.0)
+    tell(session, connection, Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), 0.0)
+    sent(connection)
+    for tick in range(1, 6):
+        session.check(connection, tick * 0.3)
+
+    session.submit("merge", None, now=1.5, deadline_s=60.0)
+    session.check(connection, 1.6)
+
+    assert any(isinstance(message, Ping) for message in sent(connection))
+
+
+def test_an_idle_connection_is_lost_when_its_ping_stays_unanswered():
+    session = make_session()
+    connection = open_connection(session)
+
+    now, events = tend_until_lost(session, connection)
+    assert events == [ConnectionLost("no pong")]
+    assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_timeout_s
 
 
 def test_time_in_which_the_robot_did_not_run_is_no_stall_of_the_server():
@@ -291,6 +362,19 @@ def test_pings_measure_the_offset_and_results_the_two_delays():
     assert (event.up_s, event.down_s) == (pytest.approx(0.03), pytest.approx(0.01))
 
 
+def test_delays_add_up_to_the_time_on_the_network_and_are_never_negative():
+    session = make_session()
+    connection = open_connection(session)
+    tell(session, connection, Pong(sent_s=0.0, received_s=100.05, answered_s=100.05), 0.1)
+    session.submit("pnp", None, now=1.0)
+    (command,) = commands(connection)
+
+    (event,) = tell(session, connection, result(command, received_s=101.0, sent_s=101.0), 1.02)
+
+    assert event.up_s == 0.0
+    assert event.down_s == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize("sent_s", [-5.0, 1e9])
 def test_a_pong_without_a_ping_does_not_change_the_clock_offset(sent_s):
     session = make_session()
@@ -299,6 +383,18 @@ def test_a_pong_without_a_ping_does_not_change_the_clock_offset(sent_s):
     tell(session, connection, Pong(sent_s=sent_s, received_s=1e6, answered_s=1e6), 0.1)
 
     assert connection.clock_offset.offset_s is None
+
+
+def test_results_without_timestamps_give_no_delays():
+    session = make_session()
+    connection = open_connection(session)
+    tell(session, connection, Pong(sent_s=0.0, received_s=5.0, answered_s=5.0), 0.02)
+    session.submit("pnp", None, now=1.0)
+    (command,) = commands(connection)
+
+    (event,) = tell(session, connection, result(command), 1.1)
+
+    assert (event.up_s, event.down_s) == (None, None)
 
 
 def test_an_invalid_message_is_a_protocol_error_and_affects_no_command():
@@ -341,3 +437,15 @@ def test_a_payload_that_cannot_be_encoded_is_refused_before_it_becomes_a_command
         session.submit("pnp", "x" * 5000, now=0.0)
 
     assert session.unanswered == 0
+
+
+def test_abandoned_commands_end_with_the_reason():
+    session = make_session()
+    connection = open_connection(session)
+    ids = [session.submit("pnp", None, now=0.0) for _ in range(3)]
+    session.close_connection(connection)
+
+    events = session.abandon("unauthorized", "the token is over", "get another")
+
+    assert codes(events) == dict.fromkeys(ids, "unauthorized")
+    assert {event.answer.hint for event in events} == {"get another"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rse_pf.wire import Cancel, Command, Failure, Progress, Result
 from rse_pf.wire.client_session import Progressed
-from tests.kit.client_sessions import codes, commands, make_session, open_connection, sent, tell
+from tests.kit.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
 
 
 def result(command: Command) -> Result:
@@ -63,6 +63,18 @@ def test_a_cancelled_command_is_cancelled_on_the_server_when_it_turns_out_to_be_
     assert sent(connection).count(Cancel(id=identity)) == 1
 
 
+def test_waiting_for_a_long_command_is_no_stall():
+    session = make_session()
+    connection = open_connection(session)
+    identity = session.submit("merge", None, now=0.0)
+    tell(session, connection, Progress(id=identity, done=0.0), 0.1)
+    session.check(connection, 0.1)
+    sent(connection)
+
+    assert session.check(connection, 0.1 + SETTINGS.ping_interval_s / 2) == []
+    assert sent(connection) == []
+
+
 def test_a_long_command_is_cancelled_once_when_its_caller_gives_up():
     session = make_session()
     connection = open_connection(session)
@@ -77,3 +89,48 @@ def test_a_long_command_is_cancelled_once_when_its_caller_gives_up():
     cancelled = Failure(id=identity, code="cancelled", message="taken back")
     assert tell(session, connection, cancelled, 0.2) == []
     assert session.unanswered == 0
+
+
+def test_a_long_command_cancelled_without_a_connection_is_cancelled_on_the_next():
+    session = make_session()
+    first = open_connection(session)
+    identity = session.submit("merge", None, now=0.0, is_open_ended=True)
+    tell(session, first, Progress(id=identity, done=0.1), 1.0)
+    session.close_connection(first)
+    session.cancel(identity)
+    session.due(1e6)
+
+    second = open_connection(session, now=1e6, server="b")
+
+    asked = [message for message in sent(second) if isinstance(message, Command | Cancel)]
+    assert [type(message) for message in asked] == [Command, Cancel]
+    assert {message.id for message in asked} == {identity}
+    taken_back = Failure(id=identity, code="cancelled", message="taken back")
+    assert tell(session, second, taken_back, 1e6 + 1) == []
+    session.close_connection(second)
+    assert commands(open_connection(session, now=1e6 + 9, server="c")) == []
+
+
+def test_a_cancel_that_was_lost_with_its_connection_is_sent_again():
+    session = make_session()
+    first = open_connection(session)
+    identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
+    tell(session, first, Progress(id=identity, done=0.1), 1.0)
+    assert codes(session.due(10.0)) == {identity: "expired"}
+    assert session.unanswered == 0
+    session.close_connection(first)
+
+    second = open_connection(session, now=20.0, server="b")
+
+    assert [message.id for message in sent(second) if isinstance(message, Cancel)] == [identity]
+    assert session.due(3600.0) == []
+
+
+def test_a_short_command_whose_caller_gave_up_is_not_sent_again():
+    session = make_session()
+    first = open_connection(session)
+    identity = session.submit("pnp", None, now=0.0)
+    session.close_connection(first)
+    session.cancel(identity)
+
+    assert commands(open_connection(session, now=1.0, server="b")) == []

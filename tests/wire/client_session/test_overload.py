@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Command, Failure, Limits, Ping, Welcome, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
+from rse_pf.wire.rate_limit import MAX_PAUSE_S
 
 CODEC = make_codec("bin")
 BUSY = {"code": "busy", "message": "too many commands wait"}
@@ -110,6 +113,30 @@ def test_after_busy_no_frame_of_its_stream_is_sent_before_the_pause_is_over(keep
     assert robot.session.held_back == {"busy": 1}
 
 
+@pytest.mark.parametrize("pause_ms", [None, 0.0, -1.0, math.nan])
+def test_busy_without_a_pause_holds_no_stream_back(pause_ms: float | None):
+    robot = RefusedSession()
+    first = robot.submit(0.0, "pose", deadline_s=0.05)
+    robot.hear(Failure(id=first, retry_after_ms=pause_ms, **BUSY), 0.06)
+
+    fresh = robot.submit(0.07, "pose")
+
+    assert robot.sent_ids == [first, fresh]
+
+
+@pytest.mark.parametrize("pause_ms", [1e300, math.inf])
+def test_no_busy_answer_holds_a_stream_back_for_longer_than_a_minute(pause_ms: float):
+    robot = RefusedSession()
+    first = robot.submit(0.0, "pose")
+    robot.hear(Failure(id=first, retry_after_ms=pause_ms, **BUSY), 0.0)
+    assert robot.ends == {first: "busy"}
+    waiting = robot.submit(1.0, "pose", deadline_s=3000.0)
+
+    robot.until(MAX_PAUSE_S + 0.01, 59.0)
+
+    assert robot.sent_ids == [first, waiting]
+
+
 def test_what_the_limits_of_the_welcome_hold_back_is_counted_as_own():
     robot = RefusedSession(room=2)
     for _ in range(5):
@@ -136,3 +163,14 @@ def test_a_frame_that_could_not_wait_ends_at_once_with_the_words_of_the_server()
     third = robot.submit(2.9, "camera", deadline_s=1.0)
     robot.until(3.2, 2.9)
     assert robot.sent_ids == [first, third]
+
+
+def test_what_a_server_said_of_a_stream_does_not_count_for_the_next_server():
+    robot = RefusedSession()
+    first = robot.submit(0.0, "camera", deadline_s=1.0)
+    robot.hear(Failure(id=first, retry_after_ms=3000.0, **BUSY), 0.1)
+
+    robot.connect(0.2)
+    second = robot.submit(0.3, "camera", deadline_s=1.0)
+
+    assert robot.sent_ids == [first, second]

@@ -54,6 +54,14 @@ def test_a_subscription_is_asked_for_at_once_and_its_updates_are_events() -> Non
         ]
 
 
+def test_no_command_has_the_id_of_a_subscription() -> None:
+    robot = SubscribedSession()
+    identity = robot.session.subscribe("live/m", 0.0)
+
+    assert robot.session.submit("echo", {"value": 1}, now=0.0) == identity + 1
+    assert robot.session.subscribe("live/n", 0.0) == identity + 2
+
+
 def test_a_subscription_begins_again_on_the_next_connection() -> None:
     robot = SubscribedSession()
     first = robot.connect()
@@ -66,6 +74,14 @@ def test_a_subscription_begins_again_on_the_next_connection() -> None:
 
     assert robot.said(second) == [Subscribe(id=identity, topic="live/m")]
     assert robot.hear(second, update(identity, 1)) == [Updated(identity, "map", None)]
+
+
+def test_one_that_was_made_while_the_connection_was_lost_begins_on_the_next() -> None:
+    robot = SubscribedSession()
+
+    identity = robot.session.subscribe("live/m", 0.0)
+
+    assert robot.said(robot.connect(1.0)) == [Subscribe(id=identity, topic="live/m")]
 
 
 def test_after_a_move_only_the_new_connection_counts() -> None:
@@ -122,6 +138,28 @@ def test_a_server_that_does_not_answer_is_asked_again_a_few_times() -> None:
     assert [(each.id, each.failure.code) for each in ended] == [(identity, "unsupported")]
 
 
+def test_one_that_was_answered_is_not_asked_for_again() -> None:
+    robot = SubscribedSession()
+    connection = robot.connect()
+    identity = robot.session.subscribe("live/m", 0.0)
+    robot.hear(connection, update(identity, 1))
+    robot.said(connection)
+
+    assert robot.session.due(100.0) == []
+    assert robot.said(connection) == []
+
+
+def test_gaps_in_the_numbers_are_the_values_that_were_replaced() -> None:
+    robot = SubscribedSession()
+    connection = robot.connect()
+    identity = robot.session.subscribe("live/m", 0.0)
+
+    for seq in (1, 2, 7, 8):
+        robot.hear(connection, update(identity, seq))
+
+    assert robot.session.subscriptions.replaced == 4
+
+
 def test_an_update_of_another_topic_or_of_no_subscription_is_ignored() -> None:
     robot = SubscribedSession()
     connection = robot.connect()
@@ -129,3 +167,23 @@ def test_an_update_of_another_topic_or_of_no_subscription_is_ignored() -> None:
 
     assert robot.hear(connection, Update(id=identity, topic="live/other", seq=1)) == []
     assert robot.hear(connection, update(identity + 1, 1)) == []
+
+
+def test_subscriptions_count_towards_the_rate_of_the_robot() -> None:
+    robot = SubscribedSession()
+    connection = robot.connect()
+    before = connection.rate_limiter.available(0.0)
+
+    robot.session.subscribe("live/m", 0.0)
+
+    assert connection.rate_limiter.available(0.0) == before - 1
+
+
+def test_a_robot_that_gives_up_ends_its_subscriptions() -> None:
+    robot = SubscribedSession()
+    identity = robot.session.subscribe("live/m", 0.0)
+
+    [ended] = robot.session.abandon("unauthorized", "the token is wrong", "issue one")
+
+    assert isinstance(ended, SubscriptionEnded)
+    assert (ended.id, ended.failure.code, ended.failure.hint) == (identity, "unauthorized", "issue one")
