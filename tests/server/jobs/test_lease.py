@@ -117,3 +117,15 @@ def test_crashes_of_owners_are_counted_but_not_orderly_ends(store, clock):
     last.take()
     assert last.record is not None
     assert last.record.tries == 1
+
+
+def test_a_process_that_takes_its_own_job_again_counts_no_crash(store, clock):
+    owner = looked(store, "one", clock)
+    assert owner.take()  # its run fails, and the store fails when the outcome is written
+
+    for _ in range(MAX_TRIES):
+        assert verdict(owner) == "take"
+        assert owner.take()
+
+    assert owner.record is not None
+    assert owner.record.tries == 1
