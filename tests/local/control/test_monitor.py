@@ -46,7 +46,7 @@ def sample_of(
 
 
 def test_cpu_is_relative_to_the_size_and_to_the_time_between_two_answers() -> None:
-    told = one(observed(100.0), observed(102.0, cpu_s=0.25), capacity=0.25)
+    sample = one(observed(100.0), observed(102.0, cpu_s=0.25), capacity=0.25)
 
     assert told.cpu_percent == 50.0
 
@@ -80,3 +80,10 @@ def test_a_period_that_goes_on_or_was_hardly_watched_gives_no_sample() -> None:
 
     assert periods.samples(119.0) == ()
     assert [sample.start_s for sample in periods.samples(120.0)] == [110.0]
+
+
+def test_counts_are_those_of_the_interval_and_levels_are_those_of_now() -> None:
+    sample = one(observed(100.0), observed(101.0, requests=40, bytes_in=500, bytes_out=5, robots=2))
+
+    assert (sample.requests, sample.bytes_in, sample.bytes_out) == (40, 500, 5)
+    assert (sample.robots, sample.queue, sample.queue_ms, sample.in_flight) == (9, 3, 12.5, 1)

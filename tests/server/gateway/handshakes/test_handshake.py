@@ -240,3 +240,9 @@ def test_the_health_page_has_one_answer_also_when_the_server_is_full():
 )  # fmt: skip
 def test_what_is_no_plain_request_is_none(data):
     assert RequestHead.parse(data) is None
+
+
+def test_the_header_counts_where_a_subprotocol_carries_another_token():
+    refused = judge(authorization="Bearer x", offered=[SUBPROTOCOLS["json"], f"rse-pf.token.{token()}"])
+
+    assert (refused.status, refused.result) == (401, "unauthorized")
