@@ -88,6 +88,14 @@ def test_no_hostile_name_is_a_live_map(name: str) -> None:
         assert len(raised.value.message) < 300
 
 
+@pytest.mark.parametrize(
+    "topic", ["m", "live/M", "live/m\n", "live/m ", "live/-m", "LIVE/m", "live/live/m", "/live/m"]
+)
+def test_a_name_that_is_nearly_that_of_a_live_map_is_none(topic: str) -> None:
+    with pytest.raises(BadRequest, match="no topic"):
+        map_of_topic(topic)
+
+
 async def test_two_spellings_are_one_topic_and_two_cases_are_two(server: GuardedServer) -> None:
     async with opened(server) as bridge:
         talker, plain, slash, other = [await bridge.client(name) for name in "abcd"]

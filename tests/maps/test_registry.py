@@ -69,6 +69,15 @@ def test_a_rollback_moves_the_head_and_deletes_nothing(maps: MapRegistry) -> Non
         maps.move_head("kitchen", "0" * 64, expected=first)
 
 
+def test_tenants_do_not_see_each_other(maps: MapRegistry) -> None:
+    store = MemoryStore()
+    commit(MapRegistry(store, "one"), 1, None)
+
+    assert MapRegistry(store, "two").names() == []
+    with pytest.raises(NotFound):
+        MapRegistry(store, "two").head("kitchen")
+
+
 def test_changed_bytes_in_the_store_are_detected() -> None:
     store = MemoryStore()
     maps = MapRegistry(store)

@@ -137,9 +137,21 @@ def test_what_cannot_be_decoded_is_left_out(codec: str, data: bytes):
     assert judge.down(data) is None
 
 
+def test_a_bomb_is_not_inflated():
+    assert redactor("zlib").up(zlib.compress(bytes(3_000_000), 9)) is None
+
+
 @pytest.mark.parametrize("codec", CODECS)
 def test_a_message_that_holds_a_secret_is_left_out(codec: str):
     sent = make_codec(codec).encode(command(trace=SECRET))
 
     assert redactor(codec, secrets=[SECRET]).up(sent) is None
     assert redactor(codec, secrets=["another"]).up(sent) is not None
+
+
+def test_a_robot_has_one_pseudonym_in_a_recording_and_another_in_the_next():
+    first, second = Pseudonyms(b"a" * 32), Pseudonyms(b"b" * 32)
+
+    assert first.robot(ROBOT) == Pseudonyms(b"a" * 32).robot(ROBOT) != second.robot(ROBOT)
+    assert first.robot(ROBOT) != first.robot(RobotId("default", ROBOT.name))
+    assert len(first.robot(ROBOT)) == len("robot-XXXXXXXX")

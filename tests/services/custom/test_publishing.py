@@ -189,6 +189,16 @@ def test_an_archive_that_no_publisher_makes_is_refused(
     assert not [path for path in tmp_path.rglob("x") if path.parent.name != "adder"]
 
 
+def test_an_archive_with_another_digest_is_not_even_opened(author: Author, tmp_path: Path) -> None:
+    entry = author.publish()
+    changed = bytearray(author.fetch(entry))
+    changed[-1] ^= 1
+
+    with pytest.raises(ConfigurationError, match="is not the one in the list"):
+        unpack_archive(entry, bytes(changed), tmp_path / "into")
+    assert not (tmp_path / "into").exists()
+
+
 @pytest.mark.parametrize(
     "change",
     [

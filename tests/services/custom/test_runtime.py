@@ -185,6 +185,16 @@ def test_a_service_that_cannot_be_loaded_is_one_line(tmp_path, language, entry, 
         opened(tmp_path, language, entry, source)
 
 
+def test_a_script_has_no_access_to_python(tmp_path):
+    service = opened(
+        tmp_path, "lua", "service.lua",
+        "local json = require 'json'\nreturn function(r) return {p = tostring(python), ok = pcall(function() "
+        "return json.encode.__globals__ end)} end",
+    )  # fmt: skip
+
+    assert service.call({}) == {"p": "nil", "ok": False}
+
+
 @pytest.mark.parametrize(
     "payload", [[1.0], {"values": {"a": 1}}, {"values": [[1.0], [1.0, 2.0]]}, {"values": [float("nan")]}]
 )

@@ -165,6 +165,15 @@ def test_every_hostile_map_is_a_typed_failure(service: str) -> None:
         assert answer.code in ("bad-request", "too-large", "invalid-camera"), (name, answer)
 
 
+def test_too_large_a_view_is_refused() -> None:
+    large = view(pixels=np.zeros(40_002, dtype=np.float32), descriptors=bytes(32 * 20_001))
+
+    answer = dispatch(REGISTRY, Command(id=1, service="place", payload=large), time.monotonic)
+
+    assert isinstance(answer, Failure)
+    assert answer.code == LimitExceeded.code
+
+
 def test_too_many_comparisons_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     most = max(len(each.descriptors) for each in WORLD.keyframes) * 40 * 4
     monkeypatch.setattr(place_service, "_MAX_COMPARISONS", most - 1)
@@ -212,6 +221,13 @@ def test_a_map_that_was_merged_often_stays_readable() -> None:
     after = decode_map(encode_map(merged)).provenance
     assert after["parents"] == [{"robot": "robot-1"}] * 2
     assert len(after["from"]) == len(merged.keyframes)
+
+
+def test_merging_refuses_more_maps_than_can_be_paired() -> None:
+    answer = asked("merge", {"maps": [MAP] * 65, "options": {"candidates": 100}})
+
+    assert isinstance(answer, Failure)
+    assert "65 maps are not within 1..64" in answer.message
 
 
 @pytest.mark.parametrize("payload", [cloud(source=[1e7 + each for each in ROOM]), cloud(target=[1e12] * 300)])

@@ -101,6 +101,15 @@ def test_networks_that_opted_out_and_phones_never_leave_the_robot() -> None:
     assert len(found.rssi_dbm) == 1
 
 
+def test_names_depend_on_the_key_and_not_on_the_spelling() -> None:
+    spelt = AccessPointReading(mac="00:16:3E:0A:00:01", ssid="x", rssi_dbm=-50)
+    other = AccessPointReading(mac="00-16-3e-0a-00-01", ssid="x", rssi_dbm=-50)
+
+    assert fingerprint_of([spelt], KEY) == fingerprint_of([other], KEY)
+    assert fingerprint_of([spelt], KEY) != fingerprint_of([spelt], b"another team's key")
+    assert "00163e0a0001" not in str(fingerprint_of([spelt], KEY))
+
+
 @pytest.mark.parametrize(
     "scan",
     [{"00:16:3e:00:00:01": -50.0}, {"00163e000001": -50.0}, {"abc": 40.0}],
@@ -112,3 +121,8 @@ def test_hardware_addresses_and_impossible_strengths_are_refused(scan: dict[str,
 
     assert isinstance(answer, Failure)
     assert answer.code == BadRequest.code
+
+
+def test_a_short_key_is_refused() -> None:
+    with pytest.raises(BadRequest, match="key has 3 bytes"):
+        fingerprint_of([], b"abc")
