@@ -148,3 +148,10 @@ def test_a_refused_address_is_shown_without_credentials(use, url):
         use(url)
     assert "secret" not in str(raised.value)
     assert "is not a" in raised.value.message
+
+
+def test_the_address_of_a_redirect_is_shown_without_credentials():
+    headers = {"Location": "https://robot:secret@host/a?token=secret"}
+    error = http_status_error("ws://host/ws", 301, headers).error
+    assert "secret" not in error.message + error.hint
+    assert "https://host/a" in error.hint

@@ -35,6 +35,17 @@ class Drive:
         return self
 
 
+def test_the_region_with_the_shortest_round_trip_is_the_best():
+    choice = RegionChoice(3, hold_s=HOLD_S)
+    choice.add_round_trip(1, 0.13)
+    choice.add_round_trip(2, 0.03)
+
+    assert choice.nearest([0, 1, 2]) == 2
+    assert choice.nearest([0, 1]) == 1
+    assert choice.nearest([0]) == 0
+    assert choice.nearest([]) is None
+
+
 def test_a_region_that_gets_slow_is_left_after_a_minute_and_not_before():
     drive = Drive().measure(30, 130, for_s=300).measure(400, 130, for_s=58)
     assert drive.changes == []
@@ -82,6 +93,17 @@ def test_a_region_that_is_lost_again_and_again_has_to_prove_itself_longer_each_t
 
     assert [round(each[0], -1) for each in returned_after_s[:4]] == [60, 120, 240, 480]
     assert max(each[0] for each in returned_after_s if each) <= 16 * HOLD_S + 10
+
+
+def test_losses_of_the_last_hour_count_and_no_older_ones():
+    drive = Drive(current=FAR)
+    for second in range(3):
+        drive.choice.add_loss(NEAR, float(second))
+    drive.now = 4000.0
+
+    drive.measure(30, 130, for_s=120)
+
+    assert [round(at - 4000.0, -1) for at, _ in drive.changes] == [60]
 
 
 def test_a_robot_that_was_suspended_has_measured_nothing_meanwhile():

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import client_sdk
+from client_sdk.commands.subscriptions import Updates
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Forbidden
@@ -105,6 +106,15 @@ async def test_a_refused_topic_is_a_typed_error_and_affects_nothing_else() -> No
             await refused.next()
         assert await granted.next() == ("map", 1)
         refused.close()
+
+
+async def test_values_that_nobody_reads_are_bounded() -> None:
+    updates = Updates("live/m", lambda: None)
+
+    for number in range(5000):
+        updates.put(f"pose/{number}", number)
+
+    assert await updates.next() == ("pose/904", 904)
 
 
 async def test_a_blocking_robot_iterates_without_asyncio() -> None:

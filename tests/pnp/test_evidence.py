@@ -30,6 +30,15 @@ def test_points_behind_the_camera_agree_with_no_pose() -> None:
     assert not len(found.inliers)
 
 
+def test_copies_of_one_correspondence_count_once() -> None:
+    rng = np.random.default_rng(0)
+    four = np.array([[100.0, 100.0], [500.0, 80.0], [320.0, 400.0], [64.0, 320.0]])
+
+    copies = four[rng.integers(0, 4, 200)] + rng.normal(size=(200, 2))
+
+    assert evidence_at(copies).independent_inliers == 4
+
+
 @pytest.mark.parametrize("strays", [0, 2, 4])
 def test_a_few_outliers_do_not_make_a_line_wide(strays: int) -> None:
     rng = np.random.default_rng(1)

@@ -135,6 +135,16 @@ def test_a_topic_of_the_wrong_content_says_so() -> None:
     assert "holds depth, where colour is expected" in robot.frames.check.fault
 
 
+def test_a_lens_with_distortion_is_undistorted() -> None:
+    robot = MessageStream(depth="")
+    robot.frames._cameras.clear()
+    robot.send("info", camera_info(robot.maker, stamp_of(0), (0.3, -0.1, 0.0, 0.0, 0.0)))
+    robot.colour(stamp_of(0))
+    frame = robot.frame()
+    assert frame is not None
+    assert not np.array_equal(frame.rgb, SHOWN.colours[0])
+
+
 def test_a_topic_that_lags_behind_when_the_bag_begins_again_hides_no_partner() -> None:
     robot = MessageStream(queue_frames=10)
     for row in (0, 1, 20):

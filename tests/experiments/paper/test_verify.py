@@ -93,6 +93,14 @@ def test_an_edited_report_differs(run):
     assert differing(run) == ["commands/failed", "round_trip_ms/p99"]
 
 
+def test_an_edited_command_differs(run):
+    rows = (run / "commands.csv").read_text().splitlines()
+    rows[5] = rows[5].replace(",ok,", ",busy,")
+    (run / "commands.csv").write_text("\n".join(rows) + "\n")
+
+    assert {"commands/answered", "commands/failed"} <= set(differing(run))
+
+
 def test_a_round_trip_that_contradicts_its_time_stamps_breaks_an_invariant(run):
     edit(run / "commands.csv", ",20.0,", ",2.0,")
     write_report(run)
@@ -140,6 +148,13 @@ def test_a_malformed_file_is_one_line_not_a_traceback(run, name):
     (run / name).write_text("time,nonsense\n1,{{\n")
     with pytest.raises(UsageError, match=r"cannot read|is not a report"):
         verify(run)
+
+
+def test_duplicates_counted_by_the_load_generator_differ(run):
+    with (run / "events.jsonl").open("a") as file:
+        EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
+
+    assert differing(run) == ["commands/twice", "wrong_poses", "invariant: no answer was delivered twice"]
 
 
 def test_the_targets_of_a_fault_are_verified_too(run):
