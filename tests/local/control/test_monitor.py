@@ -48,7 +48,7 @@ def sample_of(
 def test_cpu_is_relative_to_the_size_and_to_the_time_between_two_answers() -> None:
     sample = one(observed(100.0), observed(102.0, cpu_s=0.25), capacity=0.25)
 
-    assert told.cpu_percent == 50.0
+    assert sample.cpu_percent == 50.0
 
 
 def test_the_mean_leaves_out_who_warms_up_and_who_does_not_answer() -> None:
@@ -87,3 +87,9 @@ def test_counts_are_those_of_the_interval_and_levels_are_those_of_now() -> None:
 
     assert (sample.requests, sample.bytes_in, sample.bytes_out) == (40, 500, 5)
     assert (sample.robots, sample.queue, sample.queue_ms, sample.in_flight) == (9, 3, 12.5, 1)
+
+
+def test_healthy_is_who_passes_our_checks_and_gets_robots_from_the_balancer() -> None:
+    servers = [server("a", 1.0), server("b", 1.0), server("c", 1.0, state="draining")]
+
+    assert monitor_sample(1.0, servers, frozenset({"a", "c"})).healthy_servers == 1

@@ -246,3 +246,10 @@ def test_the_header_counts_where_a_subprotocol_carries_another_token():
     refused = judge(authorization="Bearer x", offered=[SUBPROTOCOLS["json"], f"rse-pf.token.{token()}"])
 
     assert (refused.status, refused.result) == (401, "unauthorized")
+
+
+def test_a_connection_with_a_token_within_its_leeway_ends_with_the_leeway():
+    verdict = judge(authorization=f"Bearer {token(10.0)}", now_s=NOW_S + 20)
+
+    assert isinstance(verdict, Accepted)
+    assert verdict.expires_s == NOW_S + 10 + SETTINGS.auth.leeway_s
