@@ -176,21 +176,21 @@ class AuthError(RsePfError, code="auth"):
     """A robot cannot be authenticated or is not authorized.
 
     Cause: A token, a key or the roster of enrolled robots does not let this robot in.
-    Check: Run rse-pf token inspect TOKEN, and rse-pf robot list.
+    Check: Run rse-pf audit show --only refused, which names the reason, and rse-pf robot list.
     Fix: Issue a new token, or enrol or enable the robot.
     """
 
 
 class Unauthorized(AuthError, code="unauthorized"):
-    """The token is missing, wrong or expired; only a robot that signs with its own key is told the cause.
+    """The token is missing, wrong or expired; only a robot with an enrolled key learns the cause.
 
-    Cause: There is no token, or it is expired, revoked, damaged or signed with another platform's key; or the
-        robot is disabled, or its clock is wrong.
-    Check: Run rse-pf token inspect TOKEN: it shows the seconds that are left, and whether the signature is
-        valid. For a robot with a key of its own the message names the cause, and the error of its clock.
-    Fix: Issue a new token with rse-pf token issue ROBOT; for runs of over 15 minutes pass an async function
-        that returns a fresh token, such as RobotKey(FILE, ROBOT).token. A robot that was connected tries
-        again by itself.
+    Cause: There is no token, or it is expired, revoked, damaged or signed with a key that the platform
+        does not know; or the robot is disabled, or its clock is wrong.
+    Check: Run rse-pf audit show --only refused: it names the reason. For a token, rse-pf token inspect TOKEN
+        shows the seconds that are left. A robot that signs with the key that is enrolled now gets the cause.
+    Fix: Issue a new token with rse-pf token issue ROBOT, or enrol the robot and use the new file; for runs of
+        over 15 minutes without enrolment pass an async function that returns a fresh token. A robot that was
+        connected tries again by itself.
     """
 
 

@@ -170,7 +170,7 @@ def test_the_commands_about_maps_run_on_a_store(
 
     for command in found:
         words = shlex.split(command.replace("3f9bd1", first.id[:6]))
-        assert main(words[1:]) == 0, f"{command}: {capsys.readouterr().err}"
+        assert main([*words[1:], "--store", "dir:objects"]) == 0, f"{command}: {capsys.readouterr().err}"
 
     assert len(found) == 6
     assert Path("kitchen.png").stat().st_size > 0

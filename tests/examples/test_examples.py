@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from client_sdk.datasets import open_dataset
 from client_sdk.point_map import read_ply
 from client_sdk.trajectory import read_trajectory
 from tests.examples.conftest import ExamplePlatform, Program
@@ -71,6 +72,15 @@ def test_a_video_becomes_a_map(platform: ExamplePlatform) -> None:
     along = read_trajectory(platform.folder / "out-camera" / "trajectory.txt").positions
     steps = np.arange(20)[:, None] / 19 * along[-1]
     assert np.linalg.norm(along - steps, axis=1).max() < 0.1 * np.linalg.norm(along[-1])
+
+
+def test_rendered_images_become_a_bag(platform: ExamplePlatform) -> None:
+    pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")
+
+    done = platform.run(platform.command("make_bag", "--frames", "3"))
+
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [frame.rgb.shape for frame in open_dataset(platform.folder / "kitchen.bag")] == [(480, 640, 3)] * 3
 
 
 def test_a_control_loop_gets_poses(platform: ExamplePlatform) -> None:
