@@ -15,10 +15,11 @@ from rse_pf.identity import RobotId
 from rse_pf.processes.ipc import encode_message
 from rse_pf.server.live_map.connection_security import server_context
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, lease_name
-from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection
+from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection, can_begin_map
 from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerPool, MapServerProcess
 from rse_pf.storage.object_store import MemoryStore
-from rse_pf.wire.live_map import KeyframeRequest
+from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
+from tests.kit.fake_map import keyframe_request
 from tests.kit.fakes import FakeLog
 
 
@@ -257,3 +258,11 @@ async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_tak
         await until(lambda: worker.updates and worker.updates[-1]["state"] == "idle")
         assert worker.started == []
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
+
+
+def test_only_a_first_keyframe_or_an_operator_begins_a_map():
+    assert can_begin_map(keyframe_request(0))
+    assert can_begin_map(LiveStart(map="m"))
+    assert not can_begin_map(keyframe_request(1))
+    assert not can_begin_map(keyframe_request(0, segment=1))
+    assert not can_begin_map(LiveMapRequest(map="m"))

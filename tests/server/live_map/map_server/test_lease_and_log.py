@@ -19,7 +19,7 @@ from rse_pf.server.live_map.connection_security import (
 )
 from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, map_folder, next_action
 from rse_pf.server.live_map.map_server.log import LeaseLost, LiveLog, MapSnapshot
-from rse_pf.server.live_map.map_server.state import restore
+from rse_pf.server.live_map.map_server.state import MapState, restore
 from rse_pf.storage.lease import Lease
 from rse_pf.storage.object_store import MemoryStore
 from tests.kit.fake_map import FAKE_MAP, FakeMap
@@ -214,3 +214,31 @@ def test_all_servers_use_one_key_that_outlives_them():
 
     assert internal_key(store) == internal_key(store)
     assert len(internal_key(store)) == 32
+
+
+def test_a_missing_or_damaged_entry_ends_a_replay():
+    store = MemoryStore()
+    log = log_of(store)
+    for _ in range(3):
+        log.write_entry(b"x")
+    store.delete(f"{FOLDER}log/{2:012d}")
+    with pytest.raises(StoreError, match="entry 2 of the log is missing, but 3 is there"):
+        list(log_of(store).read_entries())
+    store.put(f"{FOLDER}log/{2:012d}", b"\xff")
+    with pytest.raises(StoreError, match="damaged"):
+        list(log_of(store).read_entries())
+
+
+def test_a_snapshot_whose_part_is_missing_is_passed_over():
+    store = MemoryStore()
+    log, state = log_of(store, keeps_all=True), MapState(FAKE_MAP.empty(), 0)
+    change = [MapServerChanged(owner="a", epoch=1)]
+    newest = ""
+    for _ in range(2):
+        state.apply(log.write_entry(encode_events(change)), change)
+        log.write_snapshot(state.make_snapshot(log.stored_parts))
+        (newest,) = log.stored_parts.values()
+    assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
+    store.delete(f"{FOLDER}features/{newest}")
+
+    assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
