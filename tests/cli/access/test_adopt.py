@@ -130,3 +130,23 @@ def test_a_new_key_under_an_old_name_reads_and_counts_nothing_of_the_old_one(tmp
     assert service.ask("GET", f"/data/v1/objects/{digest_of(DATA)}").status == 404
     assert service.ask("GET", "/data/v1/objects").json["objects"] == []
     assert service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", b"x").status == 201
+
+
+def test_a_robot_without_another_identity_adopts_nothing() -> None:
+    store = MemoryStore()
+    name = stored_for(store, OLD)
+
+    adopted = adopt(store, OLD, source=OLD)
+
+    assert (adopted.objects, adopted.snapshots) == (0, 0)
+    assert store.get(name) == DATA
+    assert store.get(state_name(OLD, "counter")) == b"7"
+
+
+def test_another_tenants_robot_of_the_same_name_keeps_its_own() -> None:
+    store, other = MemoryStore(), OLD._replace(tenant="rival")
+    mine = stored_for(store, other)
+
+    adopt(store, OLD._replace(enrolment="k" * 43), source=OLD)
+
+    assert store.get(mine) == DATA

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.auth.robot_key import RobotKey
-from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
+from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.main import main
 from rse_pf.config import AuthSettings
@@ -262,3 +262,28 @@ def test_bad_input_is_one_line_and_a_hint(capsys: Capture, platform: Path, words
     Path("public.json").write_text(public)
 
     assert first in refused(capsys, *words.split())[0]
+
+
+def test_a_token_that_a_robot_signed_is_revoked_in_the_tenant_of_the_roster(
+    capsys: Capture, platform: Path
+) -> None:
+    token = asyncio.run(enrolled(capsys, "robot-1", "--tenant", "lab").token())
+
+    said(capsys, "token", "revoke", token)
+
+    assert problem(platform, token) == "revoked"
+
+
+def test_all_tokens_of_a_robot_until_now_are_revoked(capsys: Capture, platform: Path) -> None:
+    mine, others = issued(capsys), issued(capsys, "robot-2")
+
+    said(capsys, "token", "revoke", "--all-of", "robot-1", "--not-enrolled")
+
+    assert (problem(platform, mine), problem(platform, others)) == ("issued-too-early", "")
+
+
+def test_a_token_of_another_platform_is_not_revoked(capsys: Capture, platform: Path) -> None:
+    signer = SigningKey.from_seed(b"t" * 32, "another")
+    token = signer.issue("robot-1", now=time.time(), token_id="t", settings=SETTINGS)
+
+    assert "the key 'another' is not known" in refused(capsys, "token", "revoke", token)[0]

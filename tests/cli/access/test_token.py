@@ -11,7 +11,7 @@ import pytest
 from rse_pf.auth.tokens import KeySet
 from rse_pf.aws.clients import make_client
 from rse_pf.cli.main import main
-from rse_pf.local.firewall import key_file, key_set_file
+from rse_pf.local.firewall import ensure_key, key_file, key_set_file
 from rse_pf.local.state import settings_file
 
 
@@ -117,3 +117,30 @@ def test_contradicting_arguments_are_refused(
 ) -> None:
     assert main(["token", *words]) == 2
     assert "hint:" in capsys.readouterr().err
+
+
+def test_a_token_of_another_signer_fails_the_check(
+    capsys: pytest.CaptureFixture[str], platform: Path, tmp_path: Path
+) -> None:
+    token = issued(capsys)
+    (tmp_path / "another").mkdir()
+    ensure_key(tmp_path / "another", seed=b"t" * 32, key_id="k")
+
+    code, report = inspected(capsys, token, "--keys", str(key_set_file(tmp_path / "another")))
+    assert (code, report["verified"]) == (1, "no: bad-signature-or-claims")
+
+
+def test_tokens_of_a_retired_key_are_refused(capsys: pytest.CaptureFixture[str], cloud: Any) -> None:
+    main(["token", "init", "--cloud"])
+    capsys.readouterr()
+    stolen = issued(capsys, "--cloud")
+    main(["token", "rotate", "--cloud"])
+    new = published(cloud)[1]
+
+    assert main(["token", "retire", "--cloud"]) == 2, "servers may not know the new key yet"
+    assert main(["token", "retire", "--cloud", "--force"]) == 0
+
+    assert published(cloud) == [new]
+    capsys.readouterr()
+    assert inspected(capsys, stolen, "--cloud")[1]["verified"] == "no: unknown-key"
+    assert inspected(capsys, issued(capsys, "--cloud"), "--cloud")[1]["verified"] == "yes"

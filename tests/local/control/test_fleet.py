@@ -184,3 +184,31 @@ async def test_the_end_comes_although_a_cancellation_gets_lost() -> None:
         await asyncio.sleep(0)
         await world.fleet.close()
         assert heard == ["lost", "over"]
+
+
+async def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
+    async with a_fleet() as world:
+        first, _ = await world.up(2)
+        world.servers.send(first.name, signal.SIGKILL)
+        await first.over.wait()
+        while not world.fleet.dead:
+            await asyncio.sleep(0)
+        standing = world.fleet.standing(0.0)
+        assert (standing.servers, standing.healthy, dict(standing.dead)) == (2, 1, {"server-1": True})
+        assert world.balancer.targets[-1] == ["server-2"]
+
+        assert world.fleet.launch_replacement("server-1", "it ended") == "server-3"
+
+        assert world.fleet.standing(0.0).servers == 2
+        assert world.fleet.dead == {}
+
+
+async def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
+    async with a_fleet() as world:
+        first, _ = await world.up(2)
+        world.fleet.note_own_drain(first)
+        world.fleet.note_own_drain(first)
+        assert world.fleet.dead == {"server-1": False}
+        world.fleet.launch_replacement(first.name, "it ended")
+        assert world.servers.signals == []
+        assert [each["event"] for each in world.events].count("drain-start") == 1
