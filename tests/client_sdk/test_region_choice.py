@@ -35,15 +35,12 @@ class Drive:
         return self
 
 
-def test_the_region_with_the_shortest_round_trip_is_the_best():
-    choice = RegionChoice(3, hold_s=HOLD_S)
-    choice.add_round_trip(1, 0.13)
-    choice.add_round_trip(2, 0.03)
+def test_one_late_pong_is_no_slow_region():
+    choice = RegionChoice(2, hold_s=HOLD_S)
+    for round_trip_s in (0.03, 2.0, 0.03):
+        choice.add_round_trip(NEAR, round_trip_s)
 
-    assert choice.nearest([0, 1, 2]) == 2
-    assert choice.nearest([0, 1]) == 1
-    assert choice.nearest([0]) == 0
-    assert choice.nearest([]) is None
+    assert choice.round_trip_s(NEAR) == 0.03
 
 
 def test_a_region_that_gets_slow_is_left_after_a_minute_and_not_before():
@@ -70,6 +67,22 @@ def test_a_region_is_kept(pieces):
         drive.measure(near_ms, far_ms, for_s=for_s)
 
     assert drive.changes == []
+
+
+def test_a_small_share_is_no_reason_to_change_however_much_time_it_is():
+    assert Drive().measure(400, 310, for_s=600).changes == []
+    assert len(Drive().measure(400, 290, for_s=600).changes) == 1
+
+
+def test_a_change_begins_the_comparison_anew():
+    choice = RegionChoice(2, hold_s=HOLD_S)
+    chosen = []
+    for now in range(0, 2 * int(HOLD_S) + 2, 2):  # a robot that cannot follow stays in NEAR
+        choice.add_round_trip(NEAR, 0.4)
+        choice.add_round_trip(FAR, 0.13)
+        chosen.append(choice.find_nearer_region(NEAR, [NEAR, FAR], float(now)))
+
+    assert [2 * row for row, region in enumerate(chosen) if region is not None] == [HOLD_S]
 
 
 def test_two_regions_that_take_turns_every_minute_cause_at_most_one_change_a_minute():
