@@ -174,6 +174,19 @@ async def test_a_frame_without_a_pose_is_not_solved_a_second_time():
         assert (len(burst.commands), client.stats.answered_by_robot) == (1, 0)
 
 
+async def test_other_services_and_robots_without_a_token_do_not_ask():
+    async with FakeBurst() as burst, platform_with(burst) as platform:
+        platform.on_command = busy
+        async with robot(platform.url) as client:
+            with pytest.raises(Busy):
+                await client.call("echo", {"value": 1}, deadline_s=1.0)
+        async with robot(platform.url, token=None) as client:
+            with pytest.raises(Busy):
+                await client.solve_pnp(*FRAME, deadline_s=1.0)
+
+        assert burst.commands == []
+
+
 async def test_a_connection_is_kept_and_one_that_was_closed_meanwhile_costs_nothing():
     async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy

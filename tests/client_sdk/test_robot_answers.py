@@ -16,6 +16,7 @@ from rse_pf.errors import (
     LimitExceeded,
     NoConsensus,
     TooFewCorrespondences,
+    UsageError,
 )
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
@@ -69,6 +70,13 @@ async def test_a_cancelled_call_is_forgotten_and_not_sent_again():
         assert (await robot.call("echo", {"value": "here"})).reply == {"value": "here"}
         assert [command.payload for command in platform.sockets[1].commands] == [{"value": "here"}]
         assert robot.stats.unanswered == 0
+
+
+@pytest.mark.parametrize("deadline_s", [0, -1, float("nan"), float("inf"), 1e9])
+async def test_a_deadline_out_of_range_is_refused(deadline_s):
+    async with FakePlatform() as platform, connect(platform) as robot:
+        with pytest.raises(UsageError, match="deadline_s"):
+            await robot.call("echo", {}, deadline_s=deadline_s)
 
 
 async def test_a_command_that_is_too_large_is_reported_with_both_numbers_and_never_sent():

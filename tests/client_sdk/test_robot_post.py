@@ -11,6 +11,7 @@ import pytest
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
+from rse_pf.errors import Disconnected
 from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import preencode
@@ -71,6 +72,15 @@ async def test_a_posted_command_is_sent_again_on_the_next_socket_and_ends_once()
         assert robot.stats.duplicates == 0
 
 
+async def test_an_unanswered_posted_command_expires() -> None:
+    async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
+        ends = Ends()
+        robot.post("echo", {"value": 1}, ends, deadline_s=0.1)
+        await ends.until(1)
+        assert isinstance(ends.heard[0].answer, Failure)
+        assert ends.heard[0].answer.code == "expired"
+
+
 async def test_a_second_answer_to_one_command_is_dropped() -> None:
     async def twice(server: FakeServer, robot: FakeRobot, command: Command) -> None:
         answer = answer_at_once(server, robot, command)
@@ -85,6 +95,14 @@ async def test_a_second_answer_to_one_command_is_dropped() -> None:
         robot.post("echo", {"value": 1}, ends)
         await server.until(lambda: robot.stats.dropped_answers == 1)
         assert len(ends.heard) == 1
+
+
+async def test_nothing_is_posted_by_a_robot_that_is_closed() -> None:
+    async with FakeServer().running() as server:
+        async with connect(server) as robot:
+            pass
+        with pytest.raises(Disconnected):
+            robot.post("echo", {}, Ends())
 
 
 async def test_a_lost_connection_and_its_return_are_reported_once_each() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError
+from rse_pf.errors import BadRequest, RsePfError
 from rse_pf.extensions.fleet_page.clouds import packer
 from rse_pf.maps.describe import describe_map
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, encode_map
@@ -100,6 +100,14 @@ def test_a_keyframe_at_the_end_of_the_world_does_not_spoil_the_map_for_others() 
     poisoned = replace(HONEST, keyframes=(*HONEST.keyframes, replace(copy, id=999, T_world_camera=far)))
 
     assert localised(poisoned).verdict == "ok"
+
+
+def test_a_pixel_far_outside_of_every_image_is_refused_at_the_door() -> None:
+    pixels = HONEST.keyframes[0].pixels.copy()
+    pixels[0] = 1e8
+
+    with pytest.raises(BadRequest, match="a pixel not within"):
+        replace(HONEST.keyframes[0], pixels=pixels)
 
 
 @pytest.mark.parametrize(

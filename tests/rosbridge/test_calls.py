@@ -96,6 +96,13 @@ async def test_a_fresh_token_of_another_robot_is_refused_and_the_former_one_stay
         assert (await client.ask(call()))["result"]
 
 
+async def test_a_call_beyond_its_scope_is_forbidden(server: GuardedServer) -> None:
+    async with opened(server) as bridge:
+        client = await bridge.client(scopes=("services:pnp",))
+
+        assert (await client.ask(call(args={"value": 1})))["values"]["code"] == "forbidden"
+
+
 async def test_one_above_the_rate_is_refused_as_busy_with_the_id_of_its_call(server: GuardedServer) -> None:
     async with opened(server, session={"max_commands_per_s": 1.0}) as bridge:
         client = await bridge.client()
@@ -141,6 +148,24 @@ async def test_who_shows_no_token_is_closed_and_bounded_for_each_address(server:
         assert await near[0].close_code() == 4401, "who waited longest leaves at once"
         assert (await far.ask(call()))["values"]["code"] == "unauthorized"
         assert [await each.close_code() for each in (*near[1:], far)] == [4401] * 3
+
+
+async def test_one_address_has_its_own_rate_of_handshakes(server: GuardedServer) -> None:
+    async with opened(server) as bridge:
+        port = int(bridge.url.split(":")[2].partition("/")[0])
+
+        async def status(source: str) -> str:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(f"GET /rosbridge HTTP/1.1\r\nHost: x\r\nX-Forwarded-For: {source}\r\n\r\n".encode())
+            line = await reader.readline()
+            writer.close()
+            return line.decode().split()[1]
+
+        seen = [await status("10.0.0.1") for _ in range(1200)]
+
+        assert seen[0] != "429"
+        assert "429" in seen[1000:]
+        assert await status("10.0.0.2") == seen[0]
 
 
 @pytest.mark.slow

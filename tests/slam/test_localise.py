@@ -124,6 +124,16 @@ def test_one_keyframe_alone_needs_more_inliers(options, reason):
     assert found.verdict == ("weak" if reason else "ok")
 
 
+def test_few_inliers_are_weak():
+    options = LocalisationOptions()
+    strict = replace(options, relative_pose=replace(options.relative_pose, min_inliers=200))
+
+    found = place_of(MAP[:1], VIEW, CAMERA, strict)
+
+    assert found.inliers < 200
+    assert (found.verdict, found.reason) == ("weak", "few-inliers")
+
+
 def test_a_view_far_from_its_keyframes_by_metres_is_still_relative_to_them():
     moved = [(n, f, c, ELSEWHERE @ T) for n, f, c, T in MAP]
 

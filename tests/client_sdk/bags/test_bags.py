@@ -13,6 +13,7 @@ from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.bag import Bag
 from client_sdk.bags.images import decode_colour
 from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, POSE, TF, load_types
+from client_sdk.bags.poses import PoseTopic
 from client_sdk.datasets import open_dataset
 from rse_pf.geometry import Camera
 from tests.kit.recorded_bags import write_recording
@@ -123,6 +124,27 @@ def test_the_true_path_comes_from_tf_and_is_interpolated(tmp_path: Path) -> None
         np.testing.assert_allclose(
             bag.truth.positions, [[0.1 * row, 0, 1] for row in range(FRAMES)], atol=1e-9
         )
+
+
+def posed_at(*stamps_ns: int) -> PoseTopic:
+    """Return poses at these times, all of them the identity."""
+    types = load_types(is_ros1=False).types
+    poses = PoseTopic()
+    for stamp_ns in stamps_ns:
+        turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        place = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
+        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, stamp_ns), "world")
+        poses.add(types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn)))
+    return poses
+
+
+def test_no_pose_is_made_up_between_two_that_are_far_apart() -> None:
+    poses = posed_at(0, 200_000_000, 400_000_001, 500_000_000)
+
+    path = poses.path([100_000_000, 300_000_000, 450_000_000])
+
+    assert path is not None
+    assert path.timestamps_s.tolist() == [0.1, 0.45]
 
 
 def test_a_topic_of_poses_is_the_true_path_where_tf_does_not_move_the_camera(tmp_path: Path) -> None:

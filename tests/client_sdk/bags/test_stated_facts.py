@@ -254,3 +254,12 @@ def test_a_recorder_of_realsense_states_unit_cameras_and_mounts(tmp_path: Path) 
         assert middle == pytest.approx(
             [CY + FX * (22 - CY) / (0.75 * FX), CX + FX * ((22 - CX) / (0.75 * FX) - 0.15)], abs=1.0
         )
+
+
+def test_depth_of_another_lens_without_a_mount_is_a_doubt(tmp_path: Path) -> None:
+    def without_mount(w: BagWriter) -> list[Message]:
+        return [each for each in recorded_by_realsense(w) if each[1] != TRANSFORM]
+
+    with open_bag(write_bag(tmp_path, make=without_mount)) as bag:
+        assert [doubt.name.value for doubt in bag.log.doubts] == ["depth-registration"]
+        assert "fx 45) is taken as seen from where" in bag.log.doubts[0].sentence

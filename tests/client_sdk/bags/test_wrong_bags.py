@@ -135,6 +135,20 @@ def test_a_camera_that_cannot_be_used_is_refused(
     assert "--intrinsics" in raised.value.hint
 
 
+def test_depth_of_another_size_without_a_transform_is_refused(tmp_path: Path) -> None:
+    def small(w: BagWriter, stamp: int) -> object:
+        return raw_image(w, stamp, np.full((24, 32), 900, np.uint16), "16UC1", frame="elsewhere")
+
+    path = write_bag(tmp_path, change=lambda w, messages: [
+        (each[0].replace("aligned_depth_to_color", "depth"), *each[1:])
+        for each in replaced(DEPTH, small)(w, messages)
+    ])  # fmt: skip
+
+    with pytest.raises(UsageError, match="is not registered to /camera/color/image_raw") as raised:
+        open_bag(path)
+    assert "tf_static" in raised.value.hint
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -266,6 +266,14 @@ def test_retries_end_at_the_deadline(service: FakeService, robot: TimedClient) -
     assert max(robot.pauses) <= 5.0
 
 
+def test_a_retry_waits_as_long_as_the_server_asks(service: FakeService, robot: TimedClient) -> None:
+    service.script = once(failure(503, "busy", **{"Retry-After": "7"}), "PUT")
+
+    robot.client.upload(b"small")
+
+    assert robot.pauses == [7.0]
+
+
 def test_a_platform_without_a_data_service_is_reported_soon_and_with_a_hint(
     service: FakeService, robot: TimedClient
 ) -> None:

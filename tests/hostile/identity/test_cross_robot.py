@@ -54,6 +54,14 @@ def test_the_objects_of_others_are_not_found_by_any_method(service: Service, ten
     assert after == before
 
 
+def test_a_list_names_what_the_robot_has_and_nothing_else(service: Service) -> None:
+    for number in range(ROBOTS):
+        listed = service.ask("GET", "/data/v1/objects", robot=f"robot-{number}").body.decode()
+
+        assert digest_of(number) in listed
+        assert not any(digest_of(other) in listed for other in range(ROBOTS) if other != number)
+
+
 def test_a_thief_gets_the_same_answer_for_what_is_there_and_what_is_not(service: Service) -> None:
     nowhere = hashlib.sha256(b"nobody has this").hexdigest()
 
@@ -72,3 +80,11 @@ def test_a_robot_of_the_same_name_in_another_tenant_lists_stores_and_deletes_its
 
     assert service.ask("GET", path).body == secret_of(1)
     assert digest_of(1) not in service.ask("GET", "/data/v1/objects", tenant="another").body.decode()
+
+
+def test_what_a_robot_writes_under_the_digest_of_another_is_its_own(service: Service) -> None:
+    answer = service.ask("PUT", f"/data/v1/objects/{digest_of(3)}", b"another text", robot="robot-4")
+
+    assert answer.status == 400
+    owner = service.ask("GET", f"/data/v1/objects/{digest_of(3)}", robot="robot-3")
+    assert owner.body == secret_of(3)

@@ -183,6 +183,16 @@ async def test_a_fresh_token_moves_the_end_of_the_socket_and_a_bad_one_does_not(
         assert [other.code for other in wrong] == [CLOSE_TOKEN_OVER] * 2
 
 
+async def test_revoking_the_fresh_token_ends_the_socket_that_was_renewed_with_it(
+    server: GuardedServer,
+) -> None:
+    async with robots(server, [server.token("twice")]) as (socket,):
+        assert isinstance(await socket.ask(Renew(token=server.token("twice"))), Renewed)
+        fresh = f"t-{server._issued}"
+        server.access.change_deny_list(lambda d: d.with_token("default", "twice", fresh, time.time() + 900))
+        assert await socket.end(30.0) == CLOSE_REVOKED
+
+
 @pytest.mark.slow
 async def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disabled(
     server: GuardedServer, tmp_path: Path
