@@ -35,11 +35,16 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 from rse_pf.storage.files import check_exists
 
-__all__ = ["is_recording", "open_camera", "source_of_frames"]
+__all__ = ["is_device", "is_recording", "open_camera", "source_of_frames"]
 
 _BAG_ENDINGS = {".bag", ".mcap", ".db3"}  # files that `client_sdk.bags` reads, and `open_camera` refuses
 _REALSENSE = "realsense"  # name of a source that is a device, and not a file
 _SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
+
+
+def is_device(source: str) -> bool:
+    """Return whether *source* names a device: a number or ``realsense``, and no file or folder there."""
+    return (source.isdigit() or source == _REALSENSE) and not Path(source).exists()
 
 
 def open_camera(
@@ -87,7 +92,7 @@ def open_camera(
     word = str(source)
     path = Path(word)
     for name in (word,) if path.exists() or word.count(",") != 1 else word.split(","):
-        if not name.isdigit() and "://" not in name and name != _REALSENSE:
+        if not is_device(name) and "://" not in name:
             check_exists(name, _SOURCE_HINT)
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
@@ -115,7 +120,7 @@ def open_camera(
         return _open_pair(facts, images.pairs, rig, rate_hz, camera)
     if isinstance(own, Rig) and own.right is None:
         own = own.left.lens
-    if word == _REALSENSE:
+    if word == _REALSENSE and is_device(word):
         if camera == "stereo" or isinstance(own, Rig):
             raise UsageError(
                 f"{word} is one camera with depth", hint="give intrinsics of one camera, or none"

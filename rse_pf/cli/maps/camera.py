@@ -45,8 +45,12 @@ _LIVE_IMAGES = 3000
 
 @dataclass(frozen=True, kw_only=True)
 class _BoardRequest:
-    board: str | None = option("--board", metavar="CxR", help="inner corners of the board (default: 9x6)")
-    square_mm: float | None = option("--square-mm", metavar="MM", help="edge of a square (default: 25)")
+    board: str | None = option(
+        "--board", metavar="CxR", help="inner corners of a board (9x6 if only its squares are stated)"
+    )
+    square_mm: float | None = option(
+        "--square-mm", metavar="MM", help="edge of a square (25 if only a board is stated)"
+    )
 
     def read_board(self) -> Board:
         """Return the board; raises UsageError."""
@@ -65,11 +69,11 @@ class _CalibrateRequest(_BoardRequest):
     sources: tuple[str, ...] = option(
         nargs="+",
         metavar="SOURCE",
-        help="a device number, a video, images or a recording; with --stereo two of them, which see a board",
+        help="a device number, a video, images or a recording; with --stereo one or two, which see a board",
     )
     stereo: bool = option(
         "--stereo",
-        help="two devices, videos or folders, or one whose images show both cameras side by side",
+        help="calibrate a pair by a board: two sources, or one whose images show both cameras side by side",
     )
     out: Path | None = option(
         "--out", metavar="FILE", help="default: intrinsics.json; with --stereo: rig.json"
@@ -130,10 +134,11 @@ def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> 
 
 def _calibrate_with_board(request: _CalibrateRequest, board: Board) -> None:
     from client_sdk.cameras.calibration import BoardViews, calibrate
+    from client_sdk.cameras.open_camera import is_device
     from client_sdk.rigs.intrinsics import write_intrinsics
 
     views = BoardViews(board)
-    is_live = len(request.sources) == 1 and request.sources[0].isdigit()
+    is_live = len(request.sources) == 1 and is_device(request.sources[0])
     for image in _raw_images(request.sources):
         views.add(image)
         show_progress(
@@ -187,11 +192,12 @@ def _calibrate_from_motion(request: _CalibrateRequest) -> None:
 
 
 def _calibrate_stereo(request: _CalibrateRequest, board: Board) -> None:
+    from client_sdk.cameras.open_camera import is_device
     from client_sdk.cameras.stereo_calibration import PairViews, calibrate_pair
     from client_sdk.rigs.rig_file import write_rig
 
     views = PairViews(board)
-    is_live = all(source.isdigit() for source in request.sources)
+    is_live = all(is_device(source) for source in request.sources)
     for left, right in _raw_pairs(request.sources):
         views.add(left, right)
         show_progress(
@@ -235,13 +241,15 @@ def _raw_pairs(sources: Sequence[str]) -> Iterator[tuple[npt.NDArray[np.uint8], 
 def _raw_images(sources: Sequence[str]) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield grey images as the lens gives them; of a recording those of its first or left camera."""
     from client_sdk.cameras.folder import list_folder
+    from client_sdk.cameras.open_camera import is_device
     from client_sdk.cameras.opencv_video import open_video
     from client_sdk.datasets.images import is_image, read_colour
 
     paths: list[Path] = []
     for word in sources:
-        if word == "realsense" or Path(word).suffix in (".bag", ".mcap", ".db3"):
-            verb = "map from-camera" if word == "realsense" else "map from-bag"
+        is_bag = Path(word).suffix in (".bag", ".mcap", ".db3")
+        if is_bag or (word == "realsense" and is_device(word)):
+            verb = "map from-bag" if is_bag else "map from-camera"
             raise UsageError(
                 f"{word} states its own calibration, and is not calibrated here",
                 hint=f"use rse-pf {verb} {word}, or calibrate a video or a folder of its images",

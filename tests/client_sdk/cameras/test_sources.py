@@ -160,6 +160,18 @@ def test_a_rate_leaves_frames_out(tmp_path: Path) -> None:
         assert [frame.timestamp_s for frame in source] == pytest.approx([0.0, 0.2, 0.4])
 
 
+@pytest.mark.parametrize("name", ["realsense", "00"])
+def test_a_folder_with_the_name_of_a_device_is_the_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).mkdir()
+    images(tmp_path / name, depth=False)
+    monkeypatch.chdir(tmp_path)
+
+    with open_camera(name) as source:
+        assert len(list(source)) == FRAMES
+
+
 def test_a_device_that_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "VideoCapture", FakeDevice)
     ticks = itertools.count()
