@@ -7,7 +7,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from rse_pf.local.disk_watch import DiskWatch
+from rse_pf.local.disk_watch import DiskWatch, disk_level
+
+MIB = 1 << 20
 
 
 def test_each_change_is_one_event_that_names_folder_and_bytes(
@@ -55,3 +57,13 @@ async def test_the_newest_text_of_a_file_is_written_once_there_is_space(
         assert time.monotonic() < ends_s
         await asyncio.sleep(0.01)
     watching.cancel()
+
+
+def test_a_disk_is_low_below_a_tenth_and_full_below_a_mebibyte():
+    assert [disk_level(free, 1000 * MIB) for free in (200 * MIB, 99 * MIB, MIB - 1)] == ["ok", "low", "full"]
+
+
+def test_a_disk_at_the_threshold_does_not_change_its_level_with_every_write():
+    assert disk_level(105 * MIB, 1000 * MIB, "low") == "low"
+    assert disk_level(111 * MIB, 1000 * MIB, "low") == "ok"
+    assert disk_level(MIB + 1, 1000 * MIB, "full") == "full"

@@ -171,3 +171,19 @@ def test_on_a_full_disk_nothing_is_started_and_waiting_is_no_crash_loop() -> Non
     modifier.act((), now_s=60.0, period_over=False)
 
     assert servers.asked == [("replace", "server-2")]
+
+
+def test_a_dead_server_is_replaced_at_once_also_between_periods_and_on_hold() -> None:
+    modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-1": False}))
+
+    modifier.act([], now_s=61.0, period_over=False, hold=True)
+
+    assert servers.asked == [("replace", "server-1")]
+    assert (told[0]["event"], told[0]["server"], told[0]["by"]) == ("replace", "server-1", "server-11")
+
+
+def test_servers_that_lived_long_are_replaced_however_many_they_are() -> None:
+    starts, told = crashes(young=False, seconds=20)
+
+    assert len(starts) == 20
+    assert "crash-loop" not in {event["event"] for event in told}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
-from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
+from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, job_key, record_name, verdict_on
 from rse_pf.storage.object_store import MemoryStore
 
 NAME = record_name(RobotId("default", "robot-1"), "ab" * 32)
@@ -129,3 +131,16 @@ def test_a_process_that_takes_its_own_job_again_counts_no_crash(store, clock):
 
     assert owner.record is not None
     assert owner.record.tries == 1
+
+
+def test_the_key_of_a_job_is_the_digest_of_its_request(store):
+    asked = {"a": 1, "b": [1.5]}
+    key = job_key("merge", asked, "s")
+
+    assert key == job_key("merge", {"b": [1.5], "a": 1}, "s")
+    others = [("optimise", asked, "s"), ("merge", {"a": 2, "b": [1.5]}, "s"), ("merge", asked, "t")]
+    assert len({key, *(job_key(*other) for other in others)}) == 4
+    arrays = [job_key("merge", {"a": np.array([value])}, "s") for value in (0.5, 0.5, 0.25)]
+    assert arrays[0] == arrays[1] != arrays[2]
+    with pytest.raises(BadRequest):
+        job_key("merge", {"a": object()}, "s")

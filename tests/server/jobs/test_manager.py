@@ -235,3 +235,13 @@ def test_a_robot_cannot_cancel_the_commands_of_another(make):
     bench.run_until(lambda: len(bench.answers) == 2)
 
     assert {code(answer) for answer in bench.answers.values()} == {"ok"}
+
+
+def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
+    bench = make(max_running_jobs=3)
+    for identity, owner in enumerate((robot(), robot("robot-2"), robot(tenant="another"))):
+        ask(bench, owner, identity)
+
+    asked = [bench.process() for _ in range(3)]
+
+    assert len({each.request.robot for each in asked}) == 3

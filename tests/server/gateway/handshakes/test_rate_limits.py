@@ -161,3 +161,22 @@ def test_pending_handshakes_never_exceed_their_limits(steps):
             del inside[gone]
         assert len(pending) == len(inside) <= 5
         assert all(list(inside.values()).count(each) <= 2 for each in inside.values())
+
+
+def test_robots_have_buckets_of_their_own():
+    rates = RobotRates(LIMITS)
+    judged(rates, per_s=500.0, seconds=0.5, robot=RobotId("a", "flood"))
+
+    assert rates.retry_after_ms(RobotId("a", "calm"), 100.5) == 0
+    assert rates.banned_s(RobotId("a", "flood"), 100.5) > 0
+    assert rates.banned_s(RobotId("b", "flood"), 100.5) == 0, "a name belongs to its tenant"
+    assert [rates.retry_after_ms(RobotId("b", "flood"), 100.5) for _ in range(3)] == [0, 0, 0]
+
+
+def test_a_source_has_a_rate_of_handshakes(monkeypatch):
+    monkeypatch.setattr("rse_pf.server.gateway.rate_limits.HANDSHAKE_BURST", 3.0)
+    sources = SourceRates(ServingSettings(max_handshakes_per_source_per_s=10.0))
+
+    assert [sources.wait_s("a", 1.0) > 0 for _ in range(5)] == [False, False, False, True, True]
+    assert sources.wait_s("b", 1.0) == 0.0
+    assert sources.wait_s("a", 1.2) == 0.0

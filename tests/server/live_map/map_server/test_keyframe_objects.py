@@ -280,3 +280,15 @@ def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
     assert [robot for robot, _ in restored.deletable_objects] == [ONE.folder]
     assert restored.objects_of([1]) == live_map.objects_of([1]) != []
     assert restored.digest() == live_map.digest()
+
+
+def test_each_robot_has_its_share_of_a_map_with_many_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.server.live_map.map_server.keyframe_objects._MAX_SOURCES", 10)
+    store = MemoryStore()
+    mine, theirs = stored(store, ONE, some_points(1.0)), stored(store, OTHER, some_points(3.0))
+    many = [source(OTHER, theirs) for _ in range(100)]
+
+    cloud = objects(store).build_cloud([*many, source(ONE, mine), source(ONE, mine)])
+
+    assert cloud.keyframes == 10
+    assert {round(float(z)) for z in cloud.points[:, 2]} == {1, 3}
