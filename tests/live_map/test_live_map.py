@@ -20,6 +20,7 @@ from rse_pf.live_map.events import (
     MapStarted,
     Optimised,
     RobotForgotten,
+    RobotLeft,
     decode_events,
     encode_events,
     matrix_bytes,
@@ -233,6 +234,15 @@ def test_inconsistent_loop_closures_join_nothing() -> None:
     assert [each.robot for each in run.of(Joined)] == ["a"]
 
 
+def test_loop_closures_of_one_keyframe_join_nothing() -> None:
+    run, world = _two_apart()
+    links = tuple(world.true_link(12, other) for other in (0, 1, 2, 3))
+    run.apply(LoopClosuresMeasured(keyframe=12, links=links))
+
+    assert run.of(Ambiguous) == []
+    assert [each.robot for each in run.of(Joined)] == ["a"]
+
+
 def test_robots_of_one_component_need_one_loop_closure_only() -> None:
     """Robot c is in the component of robot a through robot b, so one loop closure with a is accepted."""
     world = GeneratedWorld(seed=5, links=0)
@@ -410,6 +420,16 @@ def test_a_forgotten_robot_that_drives_on_is_a_new_trajectory(joined: Run) -> No
 
     assert isinstance(added[0], Added)
     assert run.map.next_number("b") == number + 1
+
+
+def test_a_robot_that_left_has_no_alignment_but_stays_in_the_map(joined: Run) -> None:
+    run = copy_of(joined)
+    keyframes = run.map.keyframes
+    run.apply(RobotLeft(robot="b"))
+
+    assert [each.robot for each in run.map.alignments()] == ["a"]
+    assert run.map.keyframes == keyframes
+    assert run.map.contributors == ("a", "b")
 
 
 def test_an_optimisation_moves_later_keyframes_along(joined: Run) -> None:

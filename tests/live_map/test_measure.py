@@ -64,6 +64,13 @@ def test_candidates_that_are_measured_in_two_pieces_give_the_same_event():
     assert merge_measurements(0, [LoopClosuresMeasured(keyframe=0, failed={"a": 1})] * 2).failed == {"a": 2}
 
 
+def test_too_few_inliers_are_no_loop_closure():
+    found = measure_loop_closures(numbered(0), [numbered(1)], RelativePoseOptions(min_inliers=700))
+
+    assert found.links == ()
+    assert sum(found.failed.values()) == 1
+
+
 def test_a_weakly_determined_pose_is_no_loop_closure():
     near = FEATURES[0].pixels[:, 0] < 25  # a narrow column of the image
     narrow = KeyframeFeatures(

@@ -35,6 +35,15 @@ def test_three_weak_loop_closures_that_agree_join_nothing_and_five_do() -> None:
     assert live_map.loop_closure_count == 5
 
 
+def test_weak_loop_closures_add_to_those_of_full_weight() -> None:
+    live_map, world = two_apart()
+
+    joined = [add(live_map, 12 + k, world.true_link(12 + k, k)) for k in range(2)]
+    joined += [add(live_map, 12 + k, weak(world.true_link(12 + k, k))) for k in (2, 3)]
+
+    assert joined == [False, False, False, True]
+
+
 def test_full_weight_joins_although_more_weak_loop_closures_agree_on_another_place() -> None:
     live_map, world = two_apart()
     off = exp_se3([1.5, 0.3, 0.0, 0.0, 0.4, 0.0])

@@ -56,6 +56,13 @@ def test_a_scale_is_wrong_where_two_robots_differ_alike(
     assert has_wrong_scale(graph, 0, links) is is_other
 
 
+def test_robots_without_metric_scale_are_no_evidence() -> None:
+    graph = graph_of("x", "a", "b")
+    graph.segments[1].is_metric = False
+
+    assert not has_wrong_scale(graph, 0, [link(1, 0.1), link(2, 0.1)])
+
+
 def test_after_eight_keyframes_with_a_wrong_scale_a_robot_is_excluded() -> None:
     graph = graph_of("x", "a", "b")
 

@@ -12,6 +12,7 @@ import pytest
 from client_sdk.imu.estimator import ImuEstimator, ImuScale
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.geometry import Array, Camera, exp_se3, exp_so3, inverse, rotation_angle_deg
+from rse_pf.slam.inertial import upright_rotation
 from tests.kit.inertial_drive import InertialDrive, Motion, SimulatedImu
 
 CAMERA = Camera(fx=460.0, fy=460.0, cx=375.5, cy=239.5, width=752, height=480)
@@ -182,3 +183,13 @@ def test_an_inverted_mounting_is_reported():
     made = driven(change=lambda s: replace(s, model=replace(MODEL, T_imu_camera=inverse(MODEL.T_imu_camera))))
 
     assert "T_imu_camera says" in made.inertial.trouble
+
+
+def test_gravity_points_down_after_the_correction():
+    rng = np.random.default_rng(1)
+    for gravity in (*rng.normal(size=(20, 3)), np.array([0.0, 0.0, 5.0]), np.array([0.0, 0.0, -5.0])):
+        T = upright_rotation(gravity)
+        np.testing.assert_allclose(
+            T[:3, :3] @ gravity / np.linalg.norm(gravity), [0.0, 0.0, -1.0], atol=1e-12
+        )
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)

@@ -150,13 +150,6 @@ def test_a_malformed_file_is_one_line_not_a_traceback(run, name):
         verify(run)
 
 
-def test_duplicates_counted_by_the_load_generator_differ(run):
-    with (run / "events.jsonl").open("a") as file:
-        EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
-
-    assert differing(run) == ["commands/twice", "wrong_poses", "invariant: no answer was delivered twice"]
-
-
 def test_the_targets_of_a_fault_are_verified_too(run):
     events = (run / "events.jsonl").read_text().splitlines()
     asked = {**json.loads(events[0]), "kind": "robustness", "scenario": "kill"}
