@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 import pytest
 
 from lambda_pnp.keys import KeyCache, signed_request
-from rse_pf.auth.roster import DenyList, to_json
+from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster, public_key_of, to_json
 from rse_pf.auth.tokens import Claims, SigningKey
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId
@@ -132,3 +132,12 @@ def test_every_token_is_refused_while_the_deny_list_was_never_read() -> None:
     room.error = OSError("HTTP Error 403: Forbidden")
 
     assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).get("a") is None
+
+
+def test_an_enrolled_robots_key_is_known() -> None:
+    key = SigningKey.of_robot(b"r" * 32)
+    robot = EnrolledRobot(robot="r", x=public_key_of(key.public_json()))
+    room = Room()
+    room.objects["robots.json"] = to_json(Roster(robots=(robot,))).decode()
+
+    assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).robot_of(key.key_id) == robot

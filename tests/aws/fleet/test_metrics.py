@@ -93,3 +93,29 @@ def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() ->
         assert each["Dimensions"] == [{"Name": "AutoScalingGroupName", "Value": "rse-pf"}]
     assert (of_server["MetricName"], of_server["Dimensions"]) == ("Robots", dimensions_of("rse-pf", "i-1"))
     assert dimensions_of("rse-pf", "i-1")[1:] == [{"Name": "InstanceId", "Value": "i-1"}]
+
+
+def test_counters_are_published_as_the_increase_since_the_last_sample() -> None:
+    before = ServerMetrics(requests=100, bytes_in=10, answers={1.0: 90, 2.0: 100})
+    now = ServerMetrics(requests=130, bytes_in=15, robots=4, answers={1.0: 95, 2.0: 130})
+
+    published = named(datums(before, now, "group", "i-1"))
+
+    assert published["Requests"]["Value"] == 30
+    assert published["BytesIn"]["Value"] == 5
+    assert published["Robots"]["Value"] == 4
+    assert (published["AnswerMs"]["Values"], published["AnswerMs"]["Counts"]) == ([1.0, 2.0], [5, 25])
+
+
+def test_a_restarted_server_counts_from_zero_again() -> None:
+    published = named(
+        datums(
+            ServerMetrics(requests=100, answers={1.0: 100}),
+            ServerMetrics(requests=7, answers={1.0: 7}),
+            "group",
+            "i-1",
+        )
+    )
+
+    assert published["Requests"]["Value"] == 7
+    assert published["AnswerMs"]["Counts"] == [7]
