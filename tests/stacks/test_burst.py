@@ -118,3 +118,14 @@ def test_the_function_has_a_bounded_number_of_executions_outside_of_the_network(
 
     assert function["ReservedConcurrentExecutions"] == assembly.settings.cloud.lambda_concurrency
     assert "VpcConfig" not in function
+
+
+def test_the_function_writes_nothing_but_its_log(assembly: Assembly) -> None:
+    (policy,) = resources(assembly, "RsePf-Serverless", "AWS::IAM::Policy").values()
+    actions = {
+        action
+        for each in policy["PolicyDocument"]["Statement"]
+        for action in ([each["Action"]] if isinstance(each["Action"], str) else each["Action"])
+    }
+
+    assert actions == {"s3:GetObject", "logs:CreateLogStream", "logs:PutLogEvents"}

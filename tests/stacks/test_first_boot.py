@@ -16,9 +16,14 @@ import pytest
 from lambda_pnp.keys import signed_request
 from rse_pf.config import PlatformSettings
 from stacks.boot.first_boot import fetched, signed_headers, verified
+from stacks.boot.install import environment_file
 
 NOW = datetime(2026, 11, 21, 6, 0, 0, tzinfo=timezone.utc)
 USER_DATA_BYTES = 16384
+FACTS = {
+    "server": "i-0abc", "bucket": "artifacts", "keys": "keys.json", "group": "rse-pf", "hook": "drain",
+    "launch": "launch", "store": "s3:maps", "audit": "audit-logs",
+}  # fmt: skip
 
 
 def test_the_boot_script_signs_as_the_function_does() -> None:
@@ -197,3 +202,23 @@ def test_an_unknown_region_says_how_to_look_its_prefix_list_up() -> None:
     assert "com.amazonaws.mars-north-1.s3" in told.value.hint
     known = PlatformSettings.from_dict({"cloud": {"region": "mars-north-1", "s3_prefix_list": "pl-1"}})
     assert s3_prefix_list(known) == "pl-1"
+
+
+def test_a_package_without_a_list_is_refused() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("install.py", b"x")
+
+    with pytest.raises(SystemExit, match="not the one"):
+        verified(buffer.getvalue(), "0" * 64)
+
+
+def test_the_environment_file_holds_plain_words_only() -> None:
+    assert environment_file(FACTS).splitlines() == [
+        "SERVER_ID=i-0abc", "BUCKET=artifacts", "KEYS_NAME=keys.json", "GROUP=rse-pf", "HOOK=drain",
+        "LAUNCH_HOOK=launch",
+        "STORE=s3:maps", "AUDIT_BUCKET=audit-logs",
+    ]  # fmt: skip
+    for bad in ("", "a\nUser=root", "a b", '"', "$HOME"):
+        with pytest.raises(SystemExit, match="not a plain word"):
+            environment_file({**FACTS, "server": bad})

@@ -383,3 +383,11 @@ def test_the_firewall_keeps_no_samples_of_requests(assembly: Assembly) -> None:
 
     seen = [acl["VisibilityConfig"], *(rule["VisibilityConfig"] for rule in acl["Rules"])]
     assert [each["SampledRequestsEnabled"] for each in seen] == [False] * len(seen)
+
+
+def test_the_load_balancer_refuses_what_two_readers_may_understand_differently(assembly: Assembly) -> None:
+    balancer = assembly.one("AWS::ElasticLoadBalancingV2::LoadBalancer")
+    chosen = {each["Key"]: each["Value"] for each in balancer["LoadBalancerAttributes"]}
+
+    assert chosen["routing.http.desync_mitigation_mode"] == "strictest"
+    assert chosen["routing.http.drop_invalid_header_fields.enabled"] == "true"

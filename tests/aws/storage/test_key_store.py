@@ -153,3 +153,8 @@ def test_secret_and_bucket_are_found_through_the_stack(region: str, store: KeySt
     open_key_store(account, ResourceNames()).write(ring("a"))
 
     assert store.ring().to_json() == ring("a").to_json()
+
+
+def test_the_only_key_cannot_be_retired() -> None:
+    with pytest.raises(ConfigurationError):
+        ring("a").retired(now=BORN_S)

@@ -121,3 +121,25 @@ def test_long_frames_are_walked_over_even_when_their_head_is_cut(size, cut):
     pieces = [memoryview(data)[:cut], memoryview(data)[cut:]]
 
     assert sum(border.bytes_to_close(piece, len(piece)) for piece in pieces) == len(data) - 4
+
+
+def test_a_new_message_inside_of_a_message_is_refused():
+    frames = assembler()
+    frames.receive(TEXT, False, False, b"a", 0.0)
+
+    assert frames.receive(TEXT, True, False, b"b", 0.0) == CloseSocket(1002, "a message inside of a message")
+
+
+def test_empty_fragments_count():
+    frames = assembler()
+    frames.receive(BINARY, False, False, b"", 0.0)
+    decisions = [frames.receive(CONTINUATION, False, False, b"", 0.0) for _ in range(4)]
+
+    assert decisions == [None, None, None, CloseSocket(1009, "too many fragments")]
+
+
+def test_the_size_limit_holds_for_all_fragments_together():
+    frames = assembler()
+    frames.receive(BINARY, False, False, b"x" * 1500, 0.0)
+
+    assert frames.receive(CONTINUATION, True, False, b"x" * 501, 0.0) == CloseSocket(1009, "message too big")

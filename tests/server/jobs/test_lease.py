@@ -144,3 +144,9 @@ def test_the_key_of_a_job_is_the_digest_of_its_request(store):
     assert arrays[0] == arrays[1] != arrays[2]
     with pytest.raises(BadRequest):
         job_key("merge", {"a": object()}, "s")
+
+
+def test_no_robot_gets_the_job_of_another_robot_or_of_a_namesake_of_another_tenant():
+    robots = [RobotId("acme", "robot-1"), RobotId("acme", "robot-2"), RobotId("rival", "robot-1")]
+
+    assert len({record_name(robot, "ab" * 32) for robot in robots}) == 3
