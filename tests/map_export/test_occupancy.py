@@ -17,7 +17,7 @@ from rse_pf.extensions.map_export.occupancy import (
     encode_occupancy,
     make_occupancy_grid,
 )
-from rse_pf.geometry import Array, exp_se3, transform
+from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.level_surfaces import floor_normal
 from tests.kit.exact_maps import CAMERA, shares_right, world_map
@@ -151,6 +151,26 @@ def test_a_map_that_knows_gravity_is_turned_and_the_file_says_how() -> None:
     np.testing.assert_allclose(grid.T_grid_world @ down, np.eye(4), atol=1e-9)
     assert at(grid, 1.2, 3.2) == OCCUPIED
     assert b"# T_grid_world" in encode_occupancy(grid)["map.yaml"]
+
+
+def test_the_file_names_the_static_transform_of_ros() -> None:
+    T_grid_world = exp_se3([0.3, -1.2, 0.7, 0.4, -1.1, 2.0])
+    grid = replace(make_occupancy_grid(room(), UP), T_grid_world=T_grid_world)
+
+    (command,) = (
+        line
+        for line in encode_occupancy(grid)["map.yaml"].decode().splitlines()
+        if "static_transform" in line
+    )
+
+    words = command.split()
+    told = {
+        name: float(words[words.index(f"--{name}") + 1]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")
+    }
+    turn = from_quaternion([told[name] for name in ("qx", "qy", "qz", "qw")])
+    np.testing.assert_allclose(turn, T_grid_world[:3, :3], atol=1e-6)
+    np.testing.assert_allclose([told[name] for name in "xyz"], T_grid_world[:3, 3], atol=1e-6)
+    assert command.endswith("--frame-id plan --child-frame-id map")
 
 
 def test_the_files_are_those_of_map_server() -> None:
