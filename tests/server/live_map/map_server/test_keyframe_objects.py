@@ -292,3 +292,8 @@ def test_each_robot_has_its_share_of_a_map_with_many_keyframes(monkeypatch: pyte
 
     assert cloud.keyframes == 10
     assert {round(float(z)) for z in cloud.points[:, 2]} == {1, 3}
+
+    both_many = objects(store).build_cloud([*many, *[source(ONE, mine) for _ in range(100)]])
+
+    assert both_many.keyframes == 10
+    assert {round(float(z)) for z in both_many.points[:, 2]} == {1, 3}
