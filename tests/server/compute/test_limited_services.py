@@ -99,3 +99,13 @@ def test_a_reply_of_no_known_form_is_internal(
     processes.script = [reply]
 
     assert code_of(limited.compute(place(worker))) == "internal"
+
+
+def test_long_work_that_ends_at_the_deadline_is_evidence_too(
+    worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
+):
+    processes.script = [Overran(5.0, 4.5)] * 2
+
+    codes = [code_of(limited.compute(place(worker))) for _ in range(3)]
+
+    assert codes == ["expired", "expired", "busy"]
