@@ -79,8 +79,15 @@ def test_it_reports_its_figures(name: str, tmp_path: Path) -> None:
     assert figure_of(run(name, arguments, tmp_path)["figures"], figure) > 0
 
 
+SLOW = {"maps.calibration"}
+"""A calibration without a board takes minutes on a machine that does other work, too."""
+
+
 @pytest.mark.data
-@pytest.mark.parametrize("name", RUNS_ON_RECORDINGS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in RUNS_ON_RECORDINGS],
+)
 def test_it_reports_its_figures_of_recordings(name: str, recordings: Path, tmp_path: Path) -> None:
     arguments, figure = RUNS_ON_RECORDINGS[name]
     filled = [each.replace("DATA", str(recordings)).replace("FOLDER", str(tmp_path)) for each in arguments]

@@ -246,7 +246,7 @@ async def test_load_makes_it_grow_and_rest_makes_it_shrink(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A period of 1.25 s averages the ticks of CPU time; 0.04 cores are busy also beside other processes."""
-    monkeypatch.setattr("rse_pf.scaling.policy.IDLE_CPU_PERCENT", 65.0)
+    monkeypatch.setattr("rse_pf.scaling.rules.IDLE_CPU_PERCENT", 65.0)
     short = {"period_s": 10, "idle_s": 60, "warm_up_s": 0}
     settings = SETTINGS.replace(
         serving={"emulated_cores": 0.04}, scaling={**short, "min_servers": 1, "max_servers": 2}

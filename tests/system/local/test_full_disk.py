@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import time
@@ -14,8 +13,7 @@ import pytest
 
 from client_sdk import connect
 from rse_pf.audit.log import CONTROL_PLANE, audit_folder, read_entries
-from rse_pf.cli.access import robot as robot_verb
-from rse_pf.cli.access import token as token_verb
+from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.local.control.control_plane import ControlOptions
@@ -36,14 +34,6 @@ def disk(small_disk: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> 
     place = small_disk("24m")
     monkeypatch.setenv("XDG_STATE_HOME", str(place))
     return place
-
-
-def verb(module: Any, *words: str) -> int:
-    """Run one verb of the command line in this process."""
-    parser = argparse.ArgumentParser()
-    module.add_arguments(parser)
-    parser.add_argument("--settings", type=Path)
-    return int(module.run(parser.parse_args(words), SETTINGS))
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -88,10 +78,10 @@ async def live_through_a_full_disk(disk: Path, fill: Callable[[Path], Path]) -> 
         hog = fill(disk)
         await until(lambda: "disk-full" in names())
 
-        assert verb(robot_verb, "disable", "stolen", "--not-enrolled") == 0
-        assert verb(token_verb, "revoke", "--all-of", "lost", "--not-enrolled") == 0
+        assert main(["robot", "disable", "stolen", "--not-enrolled"]) == 0
+        assert main(["token", "revoke", "--all-of", "lost", "--not-enrolled"]) == 0
         for number in range(40):  # the reserve is not used up by commands
-            assert verb(robot_verb, "disable", f"other-{number}", "--not-enrolled") == 0
+            assert main(["robot", "disable", f"other-{number}", "--not-enrolled"]) == 0
         await until(lambda: not any(robots[name].connected for name in ("stolen", "lost")))
         for name in ("stolen", "lost"):
             assert await fails(robots[name])
