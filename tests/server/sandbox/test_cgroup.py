@@ -61,6 +61,13 @@ def delegate(folder: Path) -> None:
         pytest.skip("this file system keeps no attributes")
 
 
+def test_cgroups_of_a_service_manager_are_left_alone(machine: Machine) -> None:
+    machine.mount(1, "memory", "/jobs/7")
+    machine.mount_unified("/user.slice/session-1.scope")
+
+    assert own_hierarchies(machine.proc) == []
+
+
 def test_a_delegated_cgroup_and_the_root_of_a_container_are_used(machine: Machine) -> None:
     unit = machine.mount_unified("/system.slice/rse-pf.service")
     delegate(unit)
@@ -70,6 +77,24 @@ def test_a_delegated_cgroup_and_the_root_of_a_container_are_used(machine: Machin
     assert own_hierarchies(machine.proc) == [
         Hierarchy(unit, 2, ("memory", "pids", "cpu")), Hierarchy(root, 1, ("pids",)),
     ]  # fmt: skip
+
+
+def test_a_process_that_was_moved_to_the_servers_cgroup_uses_the_one_above(machine: Machine) -> None:
+    place = machine.mount(2, "", "/system.slice/rse-pf.service/rse-pf-server")
+    (place.parent / "cgroup.controllers").write_text("memory pids")
+
+    assert own_hierarchies(machine.proc) == [Hierarchy(place.parent, 2, ("memory", "pids"))]
+
+
+def test_a_folder_that_is_not_delegated_keeps_its_processes(machine: Machine) -> None:
+    container = machine.mount_unified("/")
+    cgroups = Cgroups([Hierarchy(container, 2, ("memory", "pids"))], owner=1, **LIMITS)
+
+    cgroups.prepare()
+
+    assert cgroups.controllers == ()
+    assert (container / "cgroup.subtree_control").read_text() == ""
+    assert not (container / "rse-pf-server").exists()
 
 
 def test_a_delegated_cgroup_gets_limits_for_each_sandbox(

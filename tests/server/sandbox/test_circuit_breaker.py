@@ -9,7 +9,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, WorkerLost
 from rse_pf.identity import RobotId
-from rse_pf.server.sandbox.circuit_breaker import POISON_S, CircuitBreaker
+from rse_pf.server.sandbox.circuit_breaker import POISON_S, Block, CircuitBreaker
 
 SETTINGS = PlatformSettings.from_dict({"services": {"breaker_crashes": 3}}).services
 ONE, TWO, THREE, FOUR = (RobotId("acme", f"robot-{i}") for i in range(1, 5))
@@ -73,6 +73,22 @@ def test_three_crashes_in_half_a_minute_open_the_breaker_of_a_service_for_a_minu
     assert isinstance(refusal, WorkerLost)
     assert refusal.retry_after_ms == 10_000.0
     assert refused(breaker, ONE, now=90.0) == [""]
+
+
+def test_crashes_further_apart_do_not_open_the_breaker():
+    breaker = crashing([ONE] * 20, apart_s=15.1)
+
+    assert refused(breaker, ONE, now=20 * 15.1) == [""]
+
+
+def test_after_it_closed_the_breaker_needs_as_many_crashes_again():
+    breaker = crashing([ONE] * 3, apart_s=1.0)
+    breaker.note_crash(ONE, "icp", "late", 62.0)
+    breaker.note_crash(ONE, "icp", "later", 63.0)
+    assert refused(breaker, ONE, now=64.0) == [""]
+
+    breaker.note_crash(ONE, "icp", "last", 64.0)
+    assert refused(breaker, ONE, now=64.0) == ["worker-lost"]
 
 
 # --- deadlines -------------------------------------------------------------------------------------
@@ -153,10 +169,31 @@ def test_a_service_is_refused_to_all_once_two_robots_outside_the_largest_tenant_
     ]
 
 
+def test_robots_of_one_name_in_three_tenants_are_three_robots():
+    breaker = crashing([RobotId(tenant, "robot-1") for tenant in ("a", "b", "c")])
+
+    assert refused(breaker, OTHER) == ["worker-lost"]
+
+
 def test_a_name_that_was_enrolled_again_has_nothing_of_its_predecessor():
     breaker = crashing([RobotId("acme", "robot-1", "old")] * 3)
 
     assert refused(breaker, RobotId("acme", "robot-1", "new")) == [""]
+
+
+def test_blocks_are_listed_with_reason_robots_and_time_and_those_of_most_robots_first():
+    breaker = crashing([ONE, TWO, THREE], digest="a")
+    breaker.note_crash(ONE, "icp", "a", 0.2)
+    for _ in range(3):
+        breaker.note_overrun(NAMESAKE, "pose", 0.2)
+
+    assert breaker.blocks(0.2) == [
+        Block(service="icp", reason="crashes", tenant="acme", robot=None, requests=0, left_s=60.0),
+        Block(service="icp", reason="poison", tenant="acme", robot=None, requests=1, left_s=599.9),
+        Block(service="icp", reason="poison", tenant="acme", robot="robot-1", requests=1, left_s=599.8),
+        Block(service="pose", reason="overruns", tenant="rival", robot="robot-1", requests=0, left_s=60.0),
+    ]
+    assert breaker.blocks(POISON_S + 1.0) == []
 
 
 def test_an_operator_lifts_everything_and_the_evidence_is_forgotten():
@@ -168,6 +205,15 @@ def test_an_operator_lifts_everything_and_the_evidence_is_forgotten():
     assert refused(breaker, ONE, digest="a") == [""]
     breaker.note_crash(ONE, "icp", "a", 1.0)
     assert refused(breaker, ONE, TWO, digest="a") == ["", ""]
+
+
+def test_an_operator_lifts_what_concerns_one_service():
+    breaker = crashing([ONE] * 3)
+    for i in range(3):
+        breaker.note_crash(ONE, "pose", str(i), 1.0)
+
+    assert [block.service for block in breaker.unblock(1.0, service="pose")] == ["pose"]
+    assert [block.service for block in breaker.blocks(1.0)] == ["icp"]
 
 
 # --- the operator ----------------------------------------------------------------------------------
@@ -183,6 +229,21 @@ def test_an_operator_lifts_what_concerns_one_tenant_or_one_robot():
 
     breaker.unblock(1.0, tenant="rival")
     assert refused(breaker, *robots, digest="a") == ["", "", "poison"]
+
+
+def test_what_is_refused_to_all_is_not_lifted_for_one_tenant():
+    breaker = crashing([ONE, RIVAL, OTHER])
+
+    assert breaker.unblock(1.0, tenant="acme") == []
+    assert refused(breaker, FOUR) == ["worker-lost"]
+
+
+def test_poison_expires_also_while_other_requests_crash():
+    breaker = CircuitBreaker(SETTINGS)
+    for now in (0.0, 0.0, 1e6):
+        breaker.note_crash(ONE, "icp", "old" if now == 0.0 else "new", now)
+
+    assert refused(breaker, ONE, digest="old", now=1e6) == [""]
 
 
 # --- memory ----------------------------------------------------------------------------------------

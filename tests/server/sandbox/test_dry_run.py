@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.server.sandbox.dry_run import DryRun, dry_run
 from rse_pf.services.custom.installed import read_service
-from rse_pf.wire import Result
+from rse_pf.wire import Failure, Result
 
 SOURCE = """
 import os
@@ -63,6 +64,14 @@ def test_requests_run_one_after_the_other_and_what_the_service_prints_is_shown(t
     assert lines == ["asked to add"] * 2
 
 
+def test_an_exception_of_the_service_is_a_failure_with_the_traceback_in_its_output(try_it):
+    (run,), lines = try_it({"do": "raise"})
+
+    assert isinstance(run.answer, Failure)
+    assert run.answer.code == "internal"
+    assert any("ValueError: no" in line for line in lines)
+
+
 def test_state_is_restored_after_a_crash_and_the_crash_is_shown(try_it):
     runs, lines = try_it({}, {"do": "crash"}, {})
 
@@ -86,3 +95,18 @@ def test_what_a_script_prints_without_flushing_is_shown(tmp_path: Path):
     dry_run(read_service(folder), [{}, {}], PlatformSettings(), lines.append)
 
     assert lines == ["a line", "beguna line", "begun"]
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 always imports from where it runs")
+def test_a_sandbox_that_is_started_from_inside_the_folder_imports_nothing_of_it(
+    try_it, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = tmp_path / "ran"
+    for name in ("json.py", "socket.py", "rse_pf.py", "sitecustomize.py"):
+        (tmp_path / "counter" / name).write_text(f"open({str(mark)!r}, 'w')\nraise SystemExit(1)\n")
+    monkeypatch.chdir(tmp_path / "counter")
+
+    runs, _ = try_it({})
+
+    assert isinstance(runs[0].answer, Result)
+    assert not mark.exists()

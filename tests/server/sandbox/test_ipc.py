@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import BadMessage, LimitExceeded
-from rse_pf.processes.ipc import FrameReader, encode_message, receive
+from rse_pf.processes.ipc import FrameReader, encode_message, encode_reply, receive
 from rse_pf.server.sandbox.channel import IpcChannel
 from tests.kit.fakes import FakeLoop
 
@@ -19,6 +19,20 @@ MESSAGES: list[Any] = [["ready"], [True, {"count": 1}, b"\x00\x01", 1.5], []]
 
 def framed(body: bytes) -> bytes:
     return len(body).to_bytes(4, "little") + body
+
+
+def test_messages_are_the_same_however_the_stream_is_cut():
+    stream = b"".join(map(encode_message, MESSAGES))
+
+    for size in range(1, len(stream) + 1):
+        reader = FrameReader(1000)
+        pieces = [stream[start : start + size] for start in range(0, len(stream), size)]
+        assert [message for piece in pieces for message in reader.feed(piece)] == MESSAGES
+
+
+def test_a_message_above_the_limit_is_refused_by_its_header():
+    with pytest.raises(LimitExceeded):
+        list(FrameReader(10).feed((11).to_bytes(4, "little")))
 
 
 @pytest.mark.parametrize(
@@ -36,6 +50,19 @@ def framed(body: bytes) -> bytes:
 def test_a_body_that_is_expensive_or_damaged_is_refused_with_a_typed_error(body):
     with pytest.raises((BadMessage, LimitExceeded)):
         list(FrameReader(1 << 20).feed(framed(body)))
+
+
+@pytest.mark.parametrize("reply", [[1.5] * 100_000, list(range(100)) * 1000, {"a": [[1, 2]] * 3000}])
+def test_a_reply_of_flat_lists_may_be_long(reply):
+    message = [True, reply, None, 1.5]
+
+    assert list(FrameReader(1 << 20).feed(encode_reply(message))) == [message]
+
+
+@pytest.mark.parametrize("reply", [[[1]] * 8000, ["a", 1] * 20_000, [1.5] * 200_000])
+def test_a_sandbox_sees_by_itself_that_its_reply_would_be_refused(reply):
+    with pytest.raises(LimitExceeded):
+        encode_reply([True, reply, None, 1.5])
 
 
 def test_a_blocking_receiver_gets_each_message_and_none_at_the_end():
@@ -129,3 +156,10 @@ def test_printed_lines_are_passed_on_with_limits_of_length_and_number(peer):
 
     assert peer.lines[0].endswith("x [784 characters more]")
     assert len(peer.lines) == 200
+
+
+def test_closing_reads_what_was_printed_last(peer):
+    os.write(peer.output, b"last words\nand a begun line")
+    peer.channel.close()
+
+    assert peer.lines == ["last words", "and a begun line"]

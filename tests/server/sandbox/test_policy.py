@@ -7,6 +7,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError, StoreError
 from rse_pf.identity import RobotId
+from rse_pf.processes.ipc import encode_message
 from rse_pf.server.sandbox.circuit_breaker import POISON_CRASHES, CircuitBreaker
 from rse_pf.server.sandbox.policy import (
     START_TIMEOUT_S,
@@ -118,12 +119,32 @@ def test_a_command_is_tried_twice_and_no_more():
     assert policy.sandboxes == 0
 
 
+def test_an_open_circuit_breaker_refuses_what_waits_as_well():
+    policy = make_policy(breaker_crashes=2, poison_crashes=1)
+    first, second, waiting = (make_call(payload=name) for name in "123")
+    start(policy, first)
+    policy.submit(second, 0.0)
+    policy.submit(waiting, 0.0)
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
+    policy.on_ready(number, 1.0)
+    number = created(policy.on_exit(number, "exit code 1", 1.0))
+
+    assert outcomes(policy.on_ready(number, 1.5)) == [(waiting, "worker-lost")]
+
+
 def test_a_command_whose_deadline_has_passed_is_not_tried_again():
     policy, call = make_policy(), make_call(deadline_s=1.0)
     start(policy, call)
 
     assert outcomes(policy.on_exit(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
     assert policy.sandboxes == 0
+
+
+def test_a_command_to_state_that_no_snapshot_holds_is_not_tried_again():
+    policy, call = make_policy(keeps_snapshots=False), make_call(service="counter")
+    start(policy, call)
+
+    assert outcomes(policy.on_exit(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
 
 
 def test_a_command_to_state_in_a_snapshot_is_restored_and_tried_again():
@@ -150,6 +171,27 @@ def test_commands_that_wait_move_to_the_new_sandbox_in_order():
     assert outcomes(actions) == [(running, "poison")]
     assert policy.on_ready(number, 1.0) == [SendMessage(number, b"2")]
     assert policy.on_reply(number, OK, 1.0) == [AnswerCall(second, OK), SendMessage(number, b"3")]
+
+
+def test_the_retried_command_runs_before_those_that_waited_for_it():
+    policy, running, second = make_policy(), make_call(payload="1"), make_call(payload="2")
+    start(policy, running)
+    policy.submit(second, 0.0)
+
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
+
+    assert policy.on_ready(number, 1.0) == [SendMessage(number, b"1")]
+
+
+def test_a_sandbox_that_ends_before_it_is_ready_fails_all_that_wait_and_is_not_replaced():
+    policy, first, second = make_policy(), make_call(payload="1"), make_call(payload="2")
+    policy.submit(first, 0.0)
+    policy.submit(second, 0.0)
+
+    actions = policy.on_exit(1, "exit code 1", 0.5)
+
+    assert outcomes(actions) == [(first, "worker-lost"), (second, "worker-lost")]
+    assert policy.sandboxes == 0
 
 
 def test_the_end_of_the_zygote_is_evidence_against_no_service_and_no_request():
@@ -190,6 +232,26 @@ def test_the_deadline_of_a_robot_is_no_evidence_for_others_and_its_request_no_po
     assert created(policy.submit(make_call(another, now=300.0), 300.0)) == 11
 
 
+def test_a_robot_whose_sandbox_was_killed_repeatedly_for_its_deadline_is_refused_the_service():
+    policy = make_policy(breaker_crashes=2)
+    for now in (0.0, 1.0):
+        overrun(policy, make_call(A, payload=str(now), now=now, deadline_s=0.06), now)
+    refused, other = make_call(A, payload="x", now=2.0), make_call(B, payload="x", now=2.0)
+
+    assert outcomes(policy.submit(refused, 2.0)) == [(refused, "worker-lost")]
+    assert created(policy.submit(other, 2.0)) == 3
+
+
+def test_a_late_reply_is_not_answered_again_and_lets_the_next_command_run():
+    policy, call, second = make_policy(), make_call(deadline_s=1.0), make_call(payload="2")
+    start(policy, call)
+    policy.submit(second, 0.5)
+    assert outcomes(policy.tick(1.0)) == [(call, "expired")]
+
+    assert policy.on_reply(1, OK, 1.5) == [SendMessage(1, b"2")]
+    assert policy.tick(1e9) != [], "the deadline of the second holds"
+
+
 def test_a_command_that_waited_beyond_its_deadline_costs_no_compute():
     policy, running, late = make_policy(), make_call(payload="1"), make_call(payload="2", deadline_s=1.0)
     start(policy, running)
@@ -228,6 +290,19 @@ def test_a_sandbox_that_violates_the_protocol_is_killed():
     assert policy.on_ready(1, 1.0) == [KillSandbox(1)], "ready for the second time"
 
 
+def test_a_command_for_an_idle_sandbox_that_is_being_killed_waits_for_the_next_one():
+    policy, second = make_policy(), make_call(payload="2")
+    start(policy, make_call())
+    policy.on_reply(1, OK, 1.0)
+    policy.on_violation(1, "")
+
+    assert policy.submit(second, 1.0) == []
+    number = created(policy.on_exit(1, "exit code 0", 1.1))
+
+    assert policy.on_ready(number, 1.2) == [SendMessage(number, b"2")]
+    assert second.tries == 0
+
+
 # --- connections, grace and capacity ---------------------------------------------------------------
 
 
@@ -239,6 +314,47 @@ def test_the_sandbox_of_a_robot_stays_when_one_of_the_same_name_in_another_tenan
     policy.remove_connection(namesake, 2.0)
 
     assert policy.tick(2.0 + GRACE_S) == [ReleaseSandbox(2)]
+
+
+def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
+    policy = make_policy()
+    start(policy, make_call())
+    policy.on_reply(1, OK, 1.0)
+    policy.remove_connection(A, 2.0)
+    policy.add_connection(A)
+
+    assert policy.tick(100.0) == []
+    assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
+
+
+def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
+    policy = make_policy()
+    start(policy, make_call(payload="1"))
+    policy.submit(make_call(payload="2"), 0.0)
+    policy.remove_connection(A, 1.0)
+    assert policy.held == 1
+
+    assert not any(isinstance(each, CreateSandbox) for each in policy.on_exit(1, "exit code 1", 1.5))
+
+
+def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():
+    policy = make_policy(max_sandboxes=1)
+    start(policy, make_call(A))
+    policy.on_reply(1, OK, 1.0)
+    policy.remove_connection(A, 1.0)
+
+    assert policy.submit(make_call(B), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, B)]
+
+
+def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
+    policy = make_policy(max_sandboxes=2)
+    start(policy, make_call(A))
+    start(policy, make_call(B, payload="y"))
+    policy.on_reply(2, OK, 0.5)
+    policy.remove_connection(A, 1.0)
+    call = make_call(C)
+
+    assert outcomes(policy.submit(call, 1.5)) == [(call, "busy")]
 
 
 RIVALS = [RobotId("rival", name) for name in "abcd"]
@@ -291,6 +407,19 @@ def test_a_crash_does_not_help_a_tenant_to_keep_a_place_that_another_one_claims(
     assert [code for _, code in outcomes(actions)] == ["busy", "busy"]
 
 
+def test_the_last_snapshot_is_restored_before_the_first_command_and_only_once():
+    policy, call = make_policy(), make_call(service="counter")
+    policy.submit(call, 0.0)
+
+    assert policy.on_ready(1, 0.0) == [LoadSnapshot(1, call)]
+    assert policy.on_store_reply(1, call, b"7", 0.1) == [
+        SendMessage(1, encode_message(["restore", "counter", b"7"]))
+    ]
+    assert policy.on_reply(1, SandboxReply(True, 0.1), 0.2) == [SendMessage(1, b"x")]
+    policy.on_reply(1, SandboxReply("done", 1.0, b"7"), 0.3)
+    assert policy.submit(make_call(service="counter", payload="2"), 1.0) == [SendMessage(1, b"2")]
+
+
 # --- state that outlives a sandbox -----------------------------------------------------------------
 
 
@@ -312,6 +441,25 @@ def test_a_reply_is_sent_only_after_the_state_that_belongs_to_it_is_stored():
     assert policy.on_store_reply(1, call, None, 1.1) == [AnswerCall(call, reply)]
 
 
+def test_the_next_snapshot_replaces_the_one_that_was_stored_last():
+    policy = make_policy()
+    call, second = run_counter(policy, b"1"), make_call(service="counter", payload="2")
+    policy.on_reply(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.on_store_reply(1, call, None, 1.1)
+    policy.submit(second, 2.0)
+
+    actions = policy.on_reply(1, SandboxReply("done", 1.0, b"3"), 2.1)
+
+    assert actions == [SaveSnapshot(1, second, b"2", b"3")]
+
+
+def test_state_that_did_not_change_is_not_stored_again():
+    policy = make_policy()
+    call, reply = run_counter(policy, b"1"), SandboxReply("done", 1.0, b"1")
+
+    assert policy.on_reply(1, reply, 1.0) == [AnswerCall(call, reply)]
+
+
 def test_a_store_that_fails_is_answered_as_such_and_the_sandbox_goes_on():
     policy = make_policy()
     call = run_counter(policy)
@@ -319,6 +467,17 @@ def test_a_store_that_fails_is_answered_as_such_and_the_sandbox_goes_on():
 
     assert outcomes(policy.on_store_reply(1, call, StoreError("503"), 1.1)) == [(call, "store")]
     assert policy.submit(make_call(service="counter", payload="2"), 1.2) == [SendMessage(1, b"2")]
+
+
+def test_a_restore_that_failed_is_repeated_before_the_next_command():
+    policy, call = make_policy(), make_call(service="counter")
+    start(policy, call)
+    policy.on_store_reply(1, call, b"7", 0.1)
+    assert outcomes(policy.on_reply(1, BadRequest("not a count"), 0.2)) == [(call, "bad-request")]
+
+    second = make_call(service="counter", payload="2")
+
+    assert policy.submit(second, 1.0) == [LoadSnapshot(1, second)]
 
 
 def test_the_time_that_a_sandbox_works_counts_for_its_tenant_whatever_comes_of_it():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -113,6 +114,24 @@ def services(*names: str) -> list[InstalledService]:
     ]
 
 
+CONNECTION = SimpleNamespace(robot=ROBOT)
+
+
+def test_the_former_services_answer_until_the_new_ones_are_ready() -> None:
+    parts = Parts("a")
+    parts.sandboxes.enter(CONNECTION)
+    parts.sandboxes.replace(services("a", "b"))
+
+    parts.call(1)
+    assert parts.made[0].held == 1
+    assert not parts.sandboxes.offers("b")
+
+    parts.made[1].on_ready(())
+    assert parts.sandboxes.offers("b")
+    assert parts.offered == [("a", "b")]
+    assert parts.made[1].robots == [ROBOT]
+
+
 def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() -> None:
     parts = Parts("a")
     parts.call(1)
@@ -136,6 +155,20 @@ def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() ->
         "counts of Prometheus never fall"
     )
     assert parts.sandboxes.report().cpu_s == {"sandboxes": {"acme": 3.0}}
+
+
+def test_a_service_that_was_removed_is_unknown_also_to_who_waited_for_it() -> None:
+    parts = Parts("a")
+    parts.call(1)
+    parts.sandboxes.replace([])
+
+    parts.call(2)
+    parts.made[0].reply()
+    parts.settle()
+
+    assert parts.answers == [(1, "ok"), (2, "unknown-service")]
+    assert parts.sandboxes.names == ()
+    assert parts.made[0].is_retired
 
 
 @pytest.mark.parametrize(

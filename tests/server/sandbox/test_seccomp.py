@@ -77,6 +77,26 @@ def refusal(number: int) -> int:
     return ENOSYS if 424 <= number < 0x40000000 else EPERM
 
 
+NEVER = {
+    "x86_64": {
+        "shmget": 29, "shmat": 30, "socket": 41, "sendmsg": 46, "recvmsg": 47, "setsockopt": 54, "fork": 57,
+        "vfork": 58, "execve": 59, "semget": 64, "msgget": 68, "ptrace": 101, "mknod": 133,
+        "sched_setscheduler": 144, "mlock": 149, "mount": 165, "setxattr": 188, "sched_setaffinity": 203,
+        "timer_create": 222, "mq_open": 240, "inotify_init": 253, "unshare": 272, "vmsplice": 278,
+        "setns": 308, "memfd_create": 319, "bpf": 321, "userfaultfd": 323, "io_uring_setup": 425,
+        "pidfd_open": 434, "openat2": 437, "memfd_secret": 447, "open_tree_attr": 467,
+    },
+    "aarch64": {
+        "shmget": 194, "shmat": 196, "socket": 198, "sendmsg": 211, "recvmsg": 212, "setsockopt": 208,
+        "execve": 221, "semget": 190, "msgget": 186, "ptrace": 117, "mknodat": 33, "sched_setscheduler": 119,
+        "mlock": 228, "mount": 40, "setxattr": 5, "sched_setaffinity": 122, "timer_create": 107,
+        "mq_open": 180, "inotify_init1": 26, "unshare": 97, "vmsplice": 75, "setns": 268,
+        "memfd_create": 279, "bpf": 280, "userfaultfd": 282, "io_uring_setup": 425, "pidfd_open": 434,
+        "openat2": 437, "memfd_secret": 447, "open_tree_attr": 467,
+    },
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("languages", SETS)
 def test_the_listed_calls_are_allowed_and_every_other_number_is_refused(machine, languages):
@@ -97,6 +117,23 @@ def test_some_calls_are_allowed_with_harmless_arguments_only(machine):
     for name, refused in BAD.items():
         for arguments in refused:
             assert verdict(program, machine, numbers[name], arguments) == EPERM, (name, arguments)
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_no_language_may_share_memory_start_programs_or_reach_the_kernel(machine):
+    allowed = set(allowed_calls(LANGUAGES, machine).values())
+
+    assert not {name for name, number in NEVER[machine].items() if number in allowed}
+    assert max(allowed) < 424, "a C library can do without calls of Linux 5.1 and later"
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_a_language_has_the_calls_that_it_needs_and_no_more(machine):
+    python, cpp, lua = (set(allowed_calls([each], machine)) for each in ("python", "cpp", "lua"))
+
+    assert lua < cpp < python
+    assert {"clone", "rseq"} <= cpp - lua
+    assert {"socketpair", "epoll_ctl"} <= python - cpp
 
 
 @pytest.mark.parametrize("machine", MACHINES)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -74,3 +76,23 @@ def test_page_tables_count_even_of_pages_that_are_not_resident(holding: Start) -
 
     assert list(MemoryWatcher(60 * MIB).find_excess([pid])) == [pid]
     assert MemoryWatcher(60 * MIB).find_excess([holding(4096)]) == {}
+
+
+def test_it_looks_more_often_when_a_sandbox_is_near_its_limit(holding: Start) -> None:
+    pid = holding(60 * MIB)
+    far, near = MemoryWatcher(1024 * MIB), MemoryWatcher(100 * MIB)
+
+    far.find_excess([pid])
+    near.find_excess([pid])
+
+    assert near.interval_s == pytest.approx(0.02)
+    assert far.interval_s == pytest.approx(0.25)
+
+
+def test_files_of_the_scratch_folder_count(holding: Start, tmp_path: Path) -> None:
+    pid = holding(4096)
+    (tmp_path / str(pid) / "root/scratch").mkdir(parents=True)
+    held = os.statvfs(tmp_path)
+    used = (held.f_blocks - held.f_bfree) * held.f_frsize
+
+    assert MemoryWatcher(1 << 60, proc=tmp_path).used_bytes(pid) >= used // 2 > 0
