@@ -76,6 +76,17 @@ async def test_silent_sockets_take_nothing_of_the_rate_and_a_robot_is_passed_on_
             each.close()
 
 
+async def test_a_silent_socket_is_cut_at_its_time_and_one_that_speaks_before_is_passed_on() -> None:
+    async with opened(silent_s=0.2) as port:
+        silent, robot = await port.dial(), await port.dial()
+        robot.send(b"GET")
+        assert await port.passed.get() == (2, b"GET")
+        await ended(silent)
+        assert port.acceptor.cut == 1
+        silent.close()
+        robot.close()
+
+
 async def test_sockets_that_send_wait_for_the_rate_in_their_order() -> None:
     async with opened(max_accepts_per_s=100.0, burst=2) as port:
         began = asyncio.get_running_loop().time()
@@ -86,3 +97,13 @@ async def test_sockets_that_send_wait_for_the_rate_in_their_order() -> None:
         assert port.acceptor.pauses > 0
         for each in robots:
             each.close()
+
+
+async def test_a_socket_that_ends_while_it_waits_takes_nothing_of_the_rate() -> None:
+    async with opened(max_accepts_per_s=5.0, burst=1) as port:
+        for _ in range(200):
+            (await port.dial()).close()
+        robot = await port.dial(b"GET")
+        assert await port.passed.get() == (201, b"GET")
+        assert port.acceptor.pauses == 0
+        robot.close()

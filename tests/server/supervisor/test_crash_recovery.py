@@ -81,6 +81,34 @@ class Server:
         return [action for action, _ in self.noted]
 
 
+@pytest.mark.parametrize("code", [1, 0, -signal.SIGKILL, -signal.SIGTERM])
+def test_a_worker_that_ended_otherwise_is_not_replaced(code: int) -> None:
+    server = Server()
+    server.workers[0].code = code
+
+    assert server.crash(ONE) is None
+    assert not server.noted
+
+
+def test_processes_that_wait_and_have_ended_are_passed_over_until_none_is_left() -> None:
+    server = Server(spares=3)
+    server.spares[-1].lives = False
+
+    first, second = server.crash(), server.crash()
+
+    assert [worker.pid for worker in (first, second) if worker is not None] == [101, 100]
+    assert server.crash() is None
+
+
+def test_a_crash_that_no_spare_is_left_for_is_counted_and_blamed_like_any_other() -> None:
+    server = Server(spares=1)
+    server.crash(ONE)
+
+    assert server.crash(ONE) is None
+    assert server.recovery.count == 2
+    assert server.actions() == ["server.worker-crashed", "server.worker-crashed", "server.robot-shut-out"]
+
+
 def test_two_crashes_by_one_robot_shut_it_out_everywhere_for_a_while() -> None:
     server = Server()
     other = server.workers[1]

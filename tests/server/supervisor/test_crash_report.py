@@ -89,3 +89,25 @@ def test_nobody_is_named_for_a_crash_of_another_thread_or_after_the_work() -> No
     for act in (elsewhere, afterwards):
         crash = crash_after(act)
         assert (crash.number, crash.robot) == (0, None)
+
+
+def test_a_robot_whose_place_another_one_took_is_not_confused_with_it() -> None:
+    def act(report: CrashReport) -> None:
+        report.enter(7, ROBOT)
+        report.enter(7 + 128, RobotId("acme", "another"))
+        report.compute_for(7)
+        read_at_zero()
+
+    crash = crash_after(act)
+
+    assert (crash.number, crash.robot) == (7, None)
+
+
+def test_a_name_that_is_too_long_is_not_written_over_its_neighbour() -> None:
+    def act(report: CrashReport) -> None:
+        report.enter(8, ROBOT)
+        report.enter(7, RobotId("t" * 700, "r"))
+        report.compute_for(8)
+        read_at_zero()
+
+    assert crash_after(act).robot == ROBOT
