@@ -13,6 +13,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected, LimitExceeded
 from rse_pf.extensions.batch.merge import BatchMerge, BatchMergeResult, strongest
 from rse_pf.extensions.batch.parts import PREFIX, Part
+from rse_pf.extensions.batch.tasks import strongest_rows
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_loop_closures
@@ -117,6 +118,14 @@ def test_a_finished_merge_leaves_nothing_in_the_store() -> None:
     assert not list(store.list(f"{PREFIX}/"))
 
 
+def test_progress_never_goes_back() -> None:
+    store, shares = a_store(), []
+    BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES, lambda done, what: shares.append(done))
+
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
 def test_too_many_keyframes_are_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     store = a_store()
     monkeypatch.setattr("rse_pf.extensions.batch.merge.MAX_KEYFRAMES", 20)
@@ -136,6 +145,16 @@ def test_of_too_many_links_each_pair_of_maps_keeps_its_strongest() -> None:
     own = sorted(each.inliers for each in kept if each.b == 1)
     assert own == sorted(each.inliers for each in within)[-5:]
     assert strongest(atlas, links, len(links)) == (list(links), {})
+
+
+def test_the_strongest_links_are_spread_over_the_keyframes() -> None:
+    one = in_parts().links[0]
+    inliers = {0: (90, 80, 70), 1: (50,), 2: (60, 40)}
+    links = [replace(one, a=a, inliers=count) for a, counts in inliers.items() for count in counts]
+
+    assert [(links[row].a, links[row].inliers) for row in strongest_rows(links, 4)] == [
+        (0, 90), (0, 80), (1, 50), (2, 60),
+    ]  # fmt: skip
 
 
 def test_links_that_are_not_compared_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

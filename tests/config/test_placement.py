@@ -8,15 +8,27 @@ from typing import Any
 
 import pytest
 
-from rse_pf.config import PlatformSettings
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.placement import ServerPlacement, is_loopback, live_ports
 from rse_pf.errors import SettingsError
 
 SETTINGS = PlatformSettings.from_dict({"serving": {"port": 9000, "workers": 3}})
 
 
+def test_a_settings_file_carries_a_placement_with_the_settings(tmp_path: Path) -> None:
+    placement = ServerPlacement.of(SETTINGS, host="127.0.0.1", port=0, control_port=0, store="dir:/objects")
+    file = tmp_path / "settings.json"
+    file.write_text(json.dumps(placement.document(SETTINGS)))
+
+    settings = load_settings(file)
+
+    assert ServerPlacement.read(file, settings) == placement
+    assert settings == SETTINGS
+    assert settings.digest() == SETTINGS.digest()
+
+
 def test_a_placement_changes_the_settings_of_its_server_and_nothing_else() -> None:
-    placement = ServerPlacement.of(SETTINGS, port=0, store="dir:/tmp/x", live_host="0.0.0.0")
+    placement = ServerPlacement.of(SETTINGS, port=0, store="dir:/objects", live_host="0.0.0.0")
 
     placed = placement.apply(SETTINGS)
 
@@ -51,6 +63,11 @@ def test_a_placement_that_makes_no_sense_is_refused_with_a_hint(
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.8.0.1", "::1", "localhost"])
 def test_a_loopback_address_and_the_name_localhost_are_reached_from_this_machine_alone(host: str) -> None:
     assert is_loopback(host)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.1", "localhost.example.com", "example.com", ""])
+def test_any_other_address_or_name_can_be_reached_from_elsewhere(host: str) -> None:
+    assert not is_loopback(host)
 
 
 def test_owners_of_live_maps_have_known_ports_only_where_other_machines_connect() -> None:

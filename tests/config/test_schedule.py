@@ -8,10 +8,15 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.schedule import ScheduleEntry, parse_schedule, resuming, zone_named
+from rse_pf.config.schedule import ScheduleEntry, minimum_at, parse_schedule, resuming, zone_named
 from rse_pf.errors import SettingsError
 
 OFFICE = parse_schedule("weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 min 2")
+
+
+def minimum(day: int, hour: int, minute: int = 0) -> int:
+    """Return the minimum of `OFFICE` on such a day of November 2026; the 23rd is a Monday."""
+    return minimum_at(OFFICE, datetime(2026, 11, day, hour, minute), otherwise=7)
 
 
 def test_entries_name_days_time_and_limits() -> None:
@@ -19,6 +24,18 @@ def test_entries_name_days_time_and_limits() -> None:
     assert OFFICE[2] == ScheduleEntry(days=(0, 6), hour=10, minute=0, min_servers=2)
     assert parse_schedule(" Fri-Mon 7:05  min 1 ;")[0].days == (0, 1, 5, 6)
     assert parse_schedule("") == ()
+
+
+def test_the_entry_that_began_last_holds() -> None:
+    assert [minimum(23, 7, 59), minimum(23, 8), minimum(23, 17, 59), minimum(23, 18)] == [2, 4, 4, 1]
+
+
+def test_a_weekend_goes_on_until_monday_morning() -> None:
+    assert [minimum(28, 9), minimum(28, 10), minimum(29, 23), minimum(30, 7)] == [1, 2, 2, 2]
+
+
+def test_without_a_schedule_the_settings_hold() -> None:
+    assert minimum_at((), datetime(2026, 11, 23), otherwise=7) == 7
 
 
 def test_a_time_zone_is_found_by_its_name() -> None:

@@ -138,6 +138,35 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
     assert changed.digest() != PlatformSettings().digest()
 
 
+def test_the_digest_is_the_same_wherever_the_settings_are() -> None:
+    one = PlatformSettings.from_dict({"local": {"port": 0}, "pnp": {"engine": "opencv"}})
+    same = PlatformSettings.from_dict({"pnp": {"engine": "opencv"}, "local": {"port": 0, "servers": 2}})
+
+    assert one.digest() == same.digest()
+    assert len(one.digest()) == 16
+
+
+def test_replace_keeps_the_rest_of_a_group() -> None:
+    settings = PlatformSettings.from_dict({"scaling": {"max_servers": 4}})
+
+    changed = settings.replace(scaling={"min_servers": 3})
+
+    assert (changed.scaling.min_servers, changed.scaling.max_servers) == (3, 4)
+
+
+def test_a_settings_file_holds_overrides_only(tmp_path: Path) -> None:
+    path = write(tmp_path, {"app": "python app.py", "context": {"rse-pf": {"scaling": {"max_servers": 4}}}})
+
+    assert load_settings(path).scaling.max_servers == 4
+
+
+def test_the_file_of_the_working_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path, {"context": {"rse-pf": {"local": {"servers": 5}}}})
+    monkeypatch.chdir(tmp_path)
+
+    assert load_settings().local.servers == 5
+
+
 def test_settings_at_the_top_of_a_file_are_refused_instead_of_being_left_out(tmp_path: Path) -> None:
     file = write(tmp_path, {"serving": {"port": 1}, "session": {}})
 

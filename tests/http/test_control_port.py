@@ -46,6 +46,20 @@ def test_requests_share_a_connection():
     assert got.count(b"X-A: b") == 3
 
 
+def test_old_clients_and_close_end_the_connection():
+    for request in (b"GET / HTTP/1.0\r\n\r\n", b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n"):
+        asked, got = talk(request, b"GET /again HTTP/1.1\r\n\r\n")
+
+        assert len(asked) == 1
+        assert b"Connection: close" in got
+
+
+def test_a_page_of_a_browser_is_not_local():
+    asked, _ = talk(b"POST /drain HTTP/1.1\r\nOrigin: http://evil\r\n\r\n", b"POST /drain HTTP/1.1\r\n\r\n")
+
+    assert [a.is_local for a in asked] == [False, True]
+
+
 @pytest.mark.parametrize(
     "request_bytes",
     [

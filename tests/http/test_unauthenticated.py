@@ -12,9 +12,11 @@ from typing import Any
 
 import pytest
 
+from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 from rse_pf.http.control_port import ControlReply, serve_control
 from rse_pf.http.unauthenticated import (
     FIRST_REQUEST_S,
+    KEEP_ALIVE_S,
     MAX_SILENT,
     SilentConnections,
     TlsListener,
@@ -70,6 +72,10 @@ def test_above_the_bound_the_one_that_waited_longest_is_cut_and_never_the_newest
     line.silent.cut_all()
     assert sorted(line.ended) == list(range(7))
     assert line.loop.timers == 0
+
+
+def test_keep_alive_is_longer_than_the_balancer_keeps_a_connection() -> None:
+    assert KEEP_ALIVE_S > BALANCER_IDLE_TIMEOUT_S
 
 
 # --- listeners -------------------------------------------------------------------------------------
@@ -209,6 +215,15 @@ async def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp
         newest.cancel()
         for each in (first, *silent):
             each.close()
+
+
+async def test_a_head_that_begins_after_an_answer_has_its_time_too(tmp_path: Path) -> None:
+    async with data_or_fleet_page(tmp_path, SECONDS) as port:
+        (slow,) = await silent_to(port, 1, (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n",))
+        assert b"200" in await asyncio.get_running_loop().sock_recv(slow, 4096)
+        await asyncio.get_running_loop().sock_sendall(slow, b"GET / HTTP/1.1\r\n")
+        await ended(slow)
+        slow.close()
 
 
 async def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_closed(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from rse_pf.pnp.native_solver import native_solver
+
 
 def test_the_core_has_the_version_of_the_platform(repository: Path) -> None:
     platform_file, core_file = (
@@ -18,6 +20,15 @@ def test_the_core_has_the_version_of_the_platform(repository: Path) -> None:
 
     assert version.findall(core_file) == version.findall(platform_file)
     assert set(re.findall(r'"rse-pf-native==(.+)"', platform_file)) == set(version.findall(platform_file))
+
+
+def test_the_library_uses_what_the_processor_has() -> None:
+    has = set(Path("/proc/cpuinfo").read_text(encoding="ascii").split())
+    widest = (
+        "avx512" if {"avx512f", "avx512dq", "avx512vl"} <= has else "avx2" if "avx2" in has else "portable"
+    )
+
+    assert native_solver().lanes == widest
 
 
 def test_an_editable_installation_brings_the_library_that_its_checkout_built(tmp_path: Path) -> None:

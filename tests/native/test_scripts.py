@@ -120,6 +120,27 @@ def test_where_no_compiler_works_that_of_the_ziglang_wheel_compiles(
     assert checkout.built.is_file()
 
 
+def test_without_a_compiler_and_without_ziglang_the_setup_fails_with_a_hint(checkout: Checkout) -> None:
+    checkout.add_ziglang(status=1)
+
+    done = checkout.set_up()
+
+    assert done.returncode == 2
+    assert "no C++ compiler works here, and ziglang cannot be installed\n  hint: sudo" in done.stderr
+
+
+def test_a_chosen_compiler_that_fails_stops_the_setup_and_leaves_no_old_library(checkout: Checkout) -> None:
+    checkout.built.parent.mkdir()
+    checkout.built.write_bytes(b"of older sources")
+    os.utime(checkout.built, (0, 0))
+
+    done = checkout.set_up(CXX="no-such-compiler")
+
+    assert done.returncode == 2
+    assert "does not compile with no-such-compiler\n  hint: read build/native.log" in done.stderr
+    assert not checkout.built.exists()
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # with an empty cache zig builds its own C++ library first
 def test_ziglang_builds_a_core_with_the_instructions_of_the_processor(
