@@ -9,6 +9,7 @@ import pytest
 
 from client_sdk.check.calibration import CalibrationJudgement, _Errors, judge_calibration
 from client_sdk.check.findings import FaultKind, Finding, order
+from client_sdk.check.keyframes import KeyframeStore
 from tests.kit.rendered_drives import Made, make_store
 
 
@@ -84,3 +85,11 @@ def test_a_drive_that_does_not_turn_cannot_tell_the_focal_length_and_says_so() -
     assert focal.within is not None
     assert focal.within > 0.06
     assert not judged(Made()).cannot_tell
+
+
+def test_a_drive_of_few_views_cannot_tell_anything_and_does_not_fail() -> None:
+    for store in (KeyframeStore(), make_store(Made(views=3))):
+        checked = judge_calibration(store)
+
+        assert checked.findings == ()
+        assert FaultKind.FOCAL_LENGTH in {each.kind for each in checked.cannot_tell}

@@ -64,6 +64,17 @@ def test_the_reason_is_what_the_drive_lacks(
     assert kind not in untold(replace(lacking, **better))
 
 
+def test_a_drive_that_was_not_tracked_cannot_tell_its_lens_and_says_so() -> None:
+    store = make_store(Made(seed=82, has_depth=False))
+    assert FOCAL not in {each.kind for each in judge_calibration(store).cannot_tell}
+    for keyframe in store.keyframes[4:]:
+        keyframe.T_world_camera = None
+
+    reasons = {each.kind: each.reason for each in judge_calibration(store).cannot_tell}
+
+    assert "a pose in 4 of 30 views only" in reasons[FOCAL]
+
+
 def test_a_drive_that_cannot_tell_an_offset_of_depths_doubts_its_metres() -> None:
     flat = Made(seed=83, is_wall=True, turn=0.03, moves_m=(0.6, 0.6, 0.0))
 

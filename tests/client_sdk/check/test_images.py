@@ -53,10 +53,23 @@ def test_every_second_frame_is_blurred(length_px: int) -> None:
     assert findings[FaultKind.BLUR].is_certain
 
 
+def test_frames_a_little_softer_than_their_neighbours_are_not_blurred() -> None:
+    frames = [blurred(each, 7 if row % 2 else 5) for row, each in enumerate(images())]
+
+    assert FaultKind.BLUR not in found(frames)
+
+
 def test_a_lens_out_of_focus_blurs_all_frames() -> None:
     frames = [blurred(blurred(each, 15).swapaxes(0, 1), 15).swapaxes(0, 1) for each in images()]
 
     assert found(frames)[FaultKind.BLUR].value == 1.0
+
+
+def test_a_plain_wall_is_not_blurred() -> None:
+    rng = np.random.default_rng(4)
+    wall = [np.clip(120 + 2 * rng.standard_normal((240, 320, 3)), 0, 255).astype(np.uint8) for _ in range(30)]
+
+    assert found([*images()[:30], *wall]) == {}
 
 
 def test_frames_without_an_edge_are_empty_and_not_blurred() -> None:
@@ -66,6 +79,19 @@ def test_frames_without_an_edge_are_empty_and_not_blurred() -> None:
 
     assert statistics.empty().tolist() == [False] * 12 + [True]
     assert not statistics.blurred().any()
+
+
+def test_dark_frames_are_counted() -> None:
+    frames = [np.uint8(12) * (each > 120) if row < 20 else each for row, each in enumerate(images())]
+
+    assert found(frames)[FaultKind.DARK].value == pytest.approx(20 / FRAMES)
+
+
+def test_repeated_frames_are_counted() -> None:
+    shown = images()
+    frames = [shown[row - row % 2] for row in range(FRAMES)]
+
+    assert found(frames)[FaultKind.REPEATED].value == pytest.approx(0.5)
 
 
 def test_a_camera_that_stands_still_repeats_nothing() -> None:
@@ -90,6 +116,14 @@ def test_an_uneven_rate_is_jitter_and_nothing_is_missing() -> None:
     stamps = (np.arange(FRAMES) + np.random.default_rng(6).uniform(-0.4, 0.4, FRAMES)) / 10.0
 
     assert found(images(), stamps).keys() == {FaultKind.JITTER}
+
+
+def test_few_frames_have_no_finding() -> None:
+    statistics = FrameStatistics()
+    for row in range(5):
+        statistics.add(float(row), images()[row])
+
+    assert statistics.findings()[0] == []
 
 
 def test_of_frames_that_were_left_out_on_purpose_no_gap_is_reported() -> None:

@@ -11,6 +11,7 @@ from client_sdk.check.motion import (
     MotionReference,
     check_imu,
     check_motion,
+    nothing_to_compare,
 )
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
@@ -121,6 +122,27 @@ def test_a_drive_at_one_speed_without_turns_tells_no_delay() -> None:
 
     assert findings == []
     assert {FaultKind.STAMP_DELAY, FaultKind.MIRRORED} <= {each.kind for each in untold}
+
+
+def test_paths_that_have_nothing_in_common_are_not_compared() -> None:
+    known_s = np.arange(0.0, 23.0, 0.05)
+    other = InertialDrive(MODEL, Motion(), seed=99).T_world_camera(known_s)
+
+    findings, untold = check_motion(
+        CameraMotion(stamps_s=stamps(), T_world_camera=tracked(stamps())),
+        MotionReference(path=Trajectory(known_s, other)),
+    )
+
+    assert findings == []
+    assert untold
+
+
+def test_without_a_reference_it_is_said_what_cannot_be_checked() -> None:
+    kinds = {each.kind for each in nothing_to_compare(has_depth=True)}
+
+    assert kinds == {
+        FaultKind.STAMP_DELAY, FaultKind.MIRRORED, FaultKind.SWAPPED_AXES, FaultKind.DEPTH_SCALE,
+    }  # fmt: skip
 
 
 def imu_history(shift_s: float = 0.0) -> ImuHistory:

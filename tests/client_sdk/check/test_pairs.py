@@ -71,6 +71,15 @@ def test_an_offset_that_is_small_doubtful_or_harmless_is_no_finding(found: Stere
     assert judge_pairs({0: found}).findings == ()
 
 
+def test_few_keyframes_tell_no_offset_but_leave_metres_in_doubt() -> None:
+    judged = judge_pairs({0: adjustment(0.5, 0.02, keyframes=8)})
+
+    assert judged.findings == ()
+    assert [each.kind for each in judged.cannot_tell] == [FaultKind.DISPARITY_OFFSET]
+    assert not judged.adjusted
+    assert judged.metres_deviation == pytest.approx(0.05)
+
+
 def checked(scale: float, offsets: dict[int, StereoAdjustment]) -> CheckReport:
     """Return what is said of a stereo drive whose path is too large by *scale* beside its odometry."""
     drive = DriveObserver(MotionReference(path=Trajectory(STAMPS_S, path())))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,12 @@ HALVES = np.where(np.arange(VIEWS) // 5 % 2 == 0, 0.05, -0.05)
 RAMP = np.linspace(-0.04, 0.04, VIEWS)
 
 
+WANDERING = 0.04 * np.sin(np.linspace(0.0, 5.0, VIEWS))
+
+
+STAIRS = np.repeat([-0.06, 0.0, 0.06, 0.12], 5)
+
+
 @pytest.mark.parametrize(
     ("zooms", "kind", "value"),
     [
@@ -46,3 +54,30 @@ def test_a_focal_length_that_is_not_the_same_is_found_where_it_is_known(
     assert found is not None
     assert (found.kind, found.value) == (kind, pytest.approx(value, rel=0.02))
     assert judge_zooms(adjusted(zooms, 0.2), times_s, common).finding is None
+
+
+@pytest.mark.parametrize(
+    ("zooms", "said"),
+    [(WANDERING, "parts of the drive say"), (STAIRS, "neither two cameras nor a lens that focuses")],
+)
+def test_a_focal_length_that_errors_of_depth_move_is_no_finding_and_this_is_said(
+    zooms: Array, said: str
+) -> None:
+    times_s = np.arange(VIEWS) / 2.0
+
+    judged = judge_zooms(adjusted(zooms, 0.001), times_s, adjusted(np.zeros(VIEWS), 0.001))
+
+    assert judged.finding is None
+    assert said in judged.cannot_tell[0].reason
+
+
+def test_a_drive_without_depth_does_not_blame_depth() -> None:
+    common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
+    reasons = [
+        judge_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metric_scale=has))
+        .cannot_tell[0]
+        .reason
+        for has in (True, False)
+    ]
+
+    assert ["of depth" in reason for reason in reasons] == [True, False]
