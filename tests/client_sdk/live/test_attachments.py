@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from client_sdk.commands.answer_types import PoseAnswer
-from client_sdk.frontend import FrontEndOptions, PoseQuery, extract
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.attachments import encode_keyframe_points
-from rse_pf.errors import ConnectError, Forbidden
+from rse_pf.errors import ConnectError, Forbidden, UsageError
 from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.keyframe_points import decode_points
 from tests.client_sdk.live.test_live_mapper import QUICK, drive
@@ -61,6 +61,18 @@ def test_points_lie_on_surfaces_and_not_between_them_and_have_their_colours() ->
     assert not ((v >= 39) & (v <= 60) & (u >= 99) & (u <= 120)).any()
     assert not np.isin(v, (79, 80, 159, 160)).any(), "beside an edge"
     assert np.array_equal(colours, frame.rgb[v, u])
+
+
+def test_near_points_are_thinned_to_one_for_each_centimetre() -> None:
+    frame = frame_at(0, depth=True)
+    near = Frame(timestamp_s=0.0, rgb=frame.rgb, depth_m=np.full_like(frame.depth_m, 0.4), camera=CAMERA)
+
+    data = encode_keyframe_points(near, NO_FEATURES, 12_000)
+
+    assert data is not None
+    points, _ = decode_points(data, CAMERA)
+    width_m, height_m = 0.4 * 320 / 500, 0.4 * 240 / 500
+    assert len(points) <= (width_m / 0.01 + 2) * (height_m / 0.01 + 2)
 
 
 async def test_each_keyframe_refers_to_points_that_the_robot_stores(robot: FakeLiveRobot) -> None:
@@ -135,6 +147,30 @@ async def test_a_robot_that_cannot_store_points_still_maps_and_leaves(
     assert mapper.report()["live"]["points"]["trouble"]
 
 
+async def test_a_keyframe_has_at_most_the_points_of_the_options(robot: FakeLiveRobot) -> None:
+    objects = Objects()
+    live = replace(QUICK, points=50, points_bytes_per_s=1e9, leave_s=5.0)
+    async with mapper_of(robot, objects, live) as mapper:
+        await drive(mapper, range(5))
+
+    assert objects.held
+    assert all(len(decode_points(data, CAMERA)[0]) <= 50 for data in objects.held.values())
+
+
+async def test_no_points_are_made_where_none_are_wanted(robot: FakeLiveRobot) -> None:
+    objects = Objects()
+    async with mapper_of(robot, objects, replace(QUICK, points=0)) as mapper:
+        await drive(mapper, range(5))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+    assert not objects.tries
+    assert all(decode_keyframe(request.keyframe).points is None for request in robot.kept)
+
+
+def test_more_points_than_an_object_holds_are_refused() -> None:
+    with pytest.raises(UsageError, match="points = 20000 is above 16000"):
+        LiveOptions(points=20_000)
+
+
 @pytest.mark.parametrize(("is_allowed", "is_wanted"), [(True, True), (True, False), (False, True)])
 async def test_an_image_is_stored_where_operator_and_robot_want_it(
     robot: FakeLiveRobot, is_allowed: bool, is_wanted: bool
@@ -156,6 +192,20 @@ async def test_an_image_is_stored_where_operator_and_robot_want_it(
     first = cv2.imdecode(np.frombuffer(objects.held[images[0].digest], np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(first[:, :, ::-1].astype(int) - frame_at(0, depth=True).rgb).mean() < 8.0
     assert {each.digest for each in images} == set(objects.held)
+
+
+async def test_keyframes_beyond_the_rate_limit_of_images_have_none(
+    robot: FakeLiveRobot,
+) -> None:
+    objects = Objects()
+    robot.has_images, robot.foreign_keyframes = True, 1
+    live = replace(QUICK, images_bytes_per_s=1_000.0, points=0)
+    mapper = LiveMapper(robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0)
+    async with mapper:
+        await drive(mapper, range(9))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+        images = [decode_keyframe(request.keyframe).image for request in robot.kept]
+        assert [each is not None for each in images] == [True, False, False]
 
 
 async def test_a_store_function_that_raises_is_reported_and_called_again(

@@ -15,7 +15,7 @@ import pytest
 from client_sdk import connect
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
-from client_sdk.live import Correction, LiveMapper, LiveOptions
+from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
 from client_sdk.live.keyframe_queue import (
     KeyframeQueue,
     NumberOffset,
@@ -240,6 +240,15 @@ def test_the_spool_of_a_program_that_was_killed_is_free(tmp_path: Path) -> None:
     queue.close()
 
 
+async def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers(robot: FakeLiveRobot) -> None:
+    for _ in range(2):
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(6))
+            await robot.until(lambda mapper=mapper: mapper.keyframes_waiting == 0)
+
+    assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1), (3, 1)]
+
+
 async def test_a_map_that_was_started_again_gets_new_numbers_and_ends_old_alignments(
     robot: FakeLiveRobot,
 ) -> None:
@@ -310,6 +319,20 @@ async def test_a_lost_robot_begins_a_segment_and_is_relocalised(robot: FakeLiveR
         robot.publish("alignment/me", alignment("me", None, segment=1, reason="too few closures"))
         robot.publish("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
         await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
+
+
+async def test_relocalise_sends_the_next_keyframe_without_a_pause(robot: FakeLiveRobot) -> None:
+    robot.foreign_keyframes = 50
+    patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
+    async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
+        await drive(mapper, range(2))
+        await robot.until(lambda: "live-relocalise" in robot.asked)
+        await drive(mapper, range(2, 4))
+        await robot.until(lambda: len(robot.kept) == 4)
+        assert robot.asked.count("live-relocalise") == 1
+        mapper.relocalise()
+        await drive(mapper, range(4, 5))
+        await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
 
 
 async def test_a_covered_lens_begins_no_segment_and_tracking_continues_after_it(
@@ -400,6 +423,28 @@ async def test_a_keyframe_waits_while_a_pose_query_is_open(robot: FakeLiveRobot)
         await tracking
 
     assert order[:2] == ["pose", "live-keyframe"]
+
+
+def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
+    loop = asyncio.new_event_loop()
+    robot = FakeLiveRobot()
+    try:
+        with BlockingLiveMapper(live_map(robot), loop.run_until_complete) as blocking:
+            blocking.track(frame_at(0, depth=True))
+            loop.run_until_complete(robot.until(lambda: len(robot.kept) == 1))
+            robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
+            corrections = blocking.corrections()
+            assert next(corrections).by == "map"
+            assert blocking.track(frame_at(1, depth=True)).corrected
+        assert list(corrections) == []  # they end with the live map
+    finally:
+        loop.close()
+
+
+async def test_a_map_that_is_not_joined_is_refused(robot: FakeLiveRobot) -> None:
+    mapper = live_map(robot)
+    with pytest.raises(UsageError, match="not joined"):
+        await mapper.track(frame_at(0, depth=True))
 
 
 def test_a_small_spool_opens_empty_and_a_damaged_one_is_refused(tmp_path: Path) -> None:

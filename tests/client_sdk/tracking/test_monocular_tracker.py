@@ -15,8 +15,9 @@ from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
 from client_sdk.tracking.landmark_matching import NO_LANDMARK, make_place_vector
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.trajectory import Trajectory
+from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
-from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import Features
 from tests.kit.flat_world import CAMERA, covered, foreign, frame_at
@@ -37,6 +38,26 @@ def assert_places(path: Trajectory, rows: dict[float, int], tolerance: float = 0
     wanted = np.array([rows[round(float(stamp_s), 6)] for stamp_s in path.timestamps_s], dtype=float)
     steps = np.polyfit(wanted, x, 1)
     assert np.abs(x - np.polyval(steps, wanted)).max() < tolerance * abs(steps[0]) * np.ptp(wanted)
+
+
+def replace_focal(fx: float) -> Camera:
+    return Camera(fx=fx, fy=fx, cx=CAMERA.cx, cy=CAMERA.cy, width=CAMERA.width, height=CAMERA.height)
+
+
+def test_a_start_that_waited_for_a_view_which_is_gone_begins_at_the_next_one() -> None:
+    tracker = MonocularTracker(OPTIONS)
+
+    # The camera looks elsewhere for a moment, and then moves on; frames 0 and 1 are of no use.
+    shown = [
+        foreign(frame(0, 0.0)),
+        foreign(frame(0, 0.1)),
+        *(frame(row, 0.2 + row / 10) for row in range(8)),
+    ]
+    done = run_all(tracker, shown)
+
+    assert done[-1].status == "tracked"
+    assert len(tracker.trajectory()) == 8
+    assert tracker.trajectory().timestamps_s[0] == pytest.approx(0.2)
 
 
 def test_the_motion_before_the_start_is_that_of_the_first_frames_after_it() -> None:
@@ -137,6 +158,21 @@ def test_an_older_place_that_is_seen_again_moves_what_drifted_away_from_it() -> 
     path = tracker.trajectory()
     assert path.positions[0] == pytest.approx(np.zeros(3), abs=2 * step_of)
     assert path.positions[-1, 0] < 47 * step_of  # and not 57
+
+
+def test_one_query_at_a_time_and_one_camera() -> None:
+    tracker = MonocularTracker(OPTIONS)
+    run_all(tracker, (frame(row, row / 10) for row in range(8)))
+
+    query = tracker.prepare(frame(8, 0.8))
+    assert isinstance(query, PoseQuery)
+    with pytest.raises(UsageError, match="query"):
+        tracker.prepare(frame(9, 0.9))
+    while isinstance(query, PoseQuery):
+        query = tracker.accept(query, None)
+    assert query.status == "lost"
+    with pytest.raises(UsageError, match="another one"):
+        tracker.prepare(replace(frame(9, 0.9), camera=replace_focal(600.0)))
 
 
 def position(tracked: TrackedFrame) -> Array:

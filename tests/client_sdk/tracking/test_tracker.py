@@ -14,6 +14,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
+from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference
 from tests.kit.flat_world import DEPTHS_M, STEP_M, covered, foreign, frame_at
@@ -64,6 +65,14 @@ def test_poses_follow_the_motion_and_a_keyframe_is_far_from_every_other_one() ->
     assert (tracker.frames, tracker.lost_frames) == (23, 0)
 
 
+def test_a_start_pose_is_where_the_trajectory_begins() -> None:
+    start = inverse(at(90))
+    tracker = Tracker(T_world_start=start)
+
+    assert run(tracker, frame(0)).T_world_camera is start
+    assert_at(run(tracker, frame(1)), 1, start)
+
+
 @pytest.mark.parametrize("bad", [NO_ANSWER, (at(40), 400), (np.full((4, 4), np.nan), 400), (at(0), 19)])
 def test_a_bad_answer_is_followed_by_the_last_frame_and_then_by_keyframes(bad: Answer) -> None:
     tracker = Tracker()
@@ -90,6 +99,14 @@ def test_a_lost_frame_has_no_pose_and_the_next_one_is_found_again() -> None:
     assert lost.lost
     assert tracker.lost_frames == 1
     assert_at(found, 4)
+
+
+def test_a_frame_without_features_is_lost_without_a_query() -> None:
+    tracker = Tracker()
+    assert run(tracker, covered(frame(0))).lost  # nothing to start from
+    assert not run(tracker, frame(0)).lost
+    assert isinstance(tracker.prepare(covered(frame(1))), TrackedFrame)
+    assert tracker.lost_frames == 2
 
 
 def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its_first_frame() -> None:
@@ -205,6 +222,29 @@ def test_the_map_is_thinned_and_still_known() -> None:
     assert tracker._segments[0].keyframe_count <= 4
     for row, tracked in zip(range(38, 25, -1), back, strict=True):
         assert_at(tracked, row)
+
+
+def test_one_query_at_a_time() -> None:
+    tracker = Tracker()
+    run(tracker, frame(0))
+    query = tracker.prepare(frame(1))
+    assert isinstance(query, PoseQuery)
+    with pytest.raises(UsageError, match="open"):
+        tracker.prepare(frame(2))
+    with pytest.raises(UsageError, match="open"):
+        tracker.restart(np.eye(4))
+    tracker.accept(query, *solve(query))
+    with pytest.raises(UsageError, match="not the open one"):
+        tracker.accept(query, None)
+
+
+def test_rotations_stay_rotations_over_a_long_drive() -> None:
+    tracker = Tracker()
+    poses = [run(tracker, frame(abs(20 - row % 40))).T_world_camera for row in range(200)]
+
+    for pose in poses:
+        assert pose is not None
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
 
 
 @pytest.mark.data
