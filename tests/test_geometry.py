@@ -22,6 +22,7 @@ from rse_pf.geometry import (
     pose_difference,
     skew,
     to_quaternion,
+    transform,
 )
 
 KINECT: dict[str, Any] = {"fx": 518.86, "fy": 519.47, "cx": 325.58, "cy": 253.74, "width": 640, "height": 480}
@@ -86,6 +87,14 @@ def test_the_difference_of_two_poses_is_in_metres_and_degrees() -> None:
     assert degrees == pytest.approx(2.0)
 
 
+def test_a_pose_maps_points_of_its_second_frame_into_its_first() -> None:
+    T_a_b = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
+
+    np.testing.assert_allclose(
+        transform(T_a_b, np.array([[1.0, 0, 0], [0, 1, 0]])), [[10, 21, 30], [9, 20, 30]]
+    )
+
+
 @given(
     st.lists(
         st.tuples(st.floats(-50, 700), st.floats(-50, 500), st.floats(0.01, 100)), min_size=1, max_size=20
@@ -108,6 +117,16 @@ def test_projection_is_the_matrix_of_the_camera_and_a_division() -> None:
     homogeneous = camera.matrix @ point
 
     np.testing.assert_allclose(camera.project(point[None])[0], homogeneous[:2] / homogeneous[2])
+
+
+def test_the_axes_of_a_camera_are_right_down_and_forward() -> None:
+    camera = Camera(**KINECT)
+
+    right, down = camera.project(np.array([[0.1, 0.0, 1.0], [0.0, 0.1, 1.0]]))
+
+    assert right[0] > camera.cx
+    assert right[1] == camera.cy
+    assert down[1] > camera.cy
 
 
 @pytest.mark.parametrize(

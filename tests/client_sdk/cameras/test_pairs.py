@@ -80,6 +80,23 @@ def test_videos_of_both_cameras_are_paired(tmp_path: Path, is_beside: bool) -> N
     assert int(frames[3].stereo.gray[5, 5]) == pytest.approx(200, abs=3)
 
 
+def test_images_without_a_partner_are_left_out(tmp_path: Path) -> None:
+    folder = images(tmp_path)
+    whole = [frame.timestamp_s for frame in open_camera(folder)]
+    (folder / "right" / "3.png").unlink()
+    with open_camera(folder) as pairs:
+        assert [frame.timestamp_s for frame in pairs] == whole[:3] + whole[4:]
+    (doubt,) = pairs.log.doubts
+    assert doubt.sentence.endswith("left out, without a right image: 3.png")
+
+
+def test_images_of_another_size_are_one_line(tmp_path: Path) -> None:
+    folder = images(tmp_path)
+    cv2.imwrite(str(folder / "left" / "0.png"), np.zeros((48, 48), np.uint8))
+    with pytest.raises(UsageError, match=r"images of 48x48 px, .*rig.json is for 64x48 px"):
+        open_camera(folder)
+
+
 @pytest.mark.parametrize(
     ("source", "options", "says"),
     [

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.cameras import open_camera
+from client_sdk.cameras import open_camera, read_intrinsics
 from client_sdk.cameras.source import FrameSource
 from rse_pf.errors import UsageError
 
@@ -335,6 +335,12 @@ def test_two_videos_of_different_lengths_are_refused(tmp_path: Path, rights: int
     assert "--camera left" in refused.value.hint
 
 
+def test_two_videos_of_one_length_are_joined(tmp_path: Path) -> None:
+    source = _pair_videos(tmp_path, 5, 5)
+    assert source.log.doubts == ()
+    assert len(rows_of(source)) == 5
+
+
 def _pair_folders(path: Path, lost: Sequence[int], names: str = "{}") -> FrameSource:
     """Return pairs of a camera that moves down; the numbers of right images skip none that was lost."""
     texture = np.kron(np.random.default_rng(5).integers(0, 256, (90, 60)), np.ones((6, 6))).astype(np.uint8)
@@ -444,3 +450,9 @@ def test_calibrations_of_other_programs_name_the_way_to_intrinsics(
     with pytest.raises(UsageError) as refused:
         open_camera(tmp_path, intrinsics=tmp_path / name)
     assert "intrinsics.json" in refused.value.hint
+
+
+def test_a_projection_without_a_distortion_model_keeps_its_projection(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, ["0.png"], camera_model="equidistant", distortion_model="none")
+
+    assert read_intrinsics(folder / "intrinsics.json").model == "fisheye"

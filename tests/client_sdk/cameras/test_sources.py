@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from client_sdk.cameras import FrameSource, Intrinsics, open_camera, write_intrinsics
+from client_sdk.cameras import FrameSource, Intrinsics, open_camera, read_intrinsics, write_intrinsics
 from client_sdk.cameras.opencv_video import open_video
-from rse_pf.errors import UsageError
+from rse_pf.errors import MissingExtra, RsePfError, UsageError
 from rse_pf.geometry import Camera
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -160,6 +160,12 @@ def test_a_rate_leaves_frames_out(tmp_path: Path) -> None:
         assert [frame.timestamp_s for frame in source] == pytest.approx([0.0, 0.2, 0.4])
 
 
+def test_depth_can_be_left_out(tmp_path: Path) -> None:
+    with open_camera(recording(tmp_path), depth=False) as source:
+        assert not next(source).depth_m.any()
+        assert not source.has_depth
+
+
 @pytest.mark.parametrize("name", ["realsense", "00"])
 def test_a_folder_with_the_name_of_a_device_is_the_folder(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -199,6 +205,26 @@ def test_opencv_is_silenced_where_its_version_has_the_function(
     with open_camera(video(tmp_path), intrinsics=INTRINSICS) as source:
         assert len(list(source)) == FRAMES
     assert levels == [0]
+
+
+def test_a_distorted_lens_is_straightened(tmp_path: Path) -> None:
+    bent = Intrinsics(camera=CAMERA, distortion=(-0.4, 0.1, 0.0, 0.0, 0.0))
+    path = video(tmp_path)
+
+    *_, straight = open_camera(path, intrinsics=bent)
+    *_, plain = open_camera(path, intrinsics=INTRINSICS)
+
+    assert not np.array_equal(straight.rgb, plain.rgb)
+
+
+def test_intrinsics_are_read_as_they_were_written(tmp_path: Path) -> None:
+    made = Intrinsics(
+        camera=CAMERA, distortion=(0.1, 0.0, 0.0, 0.0, 0.2), depth_scale=5000.0, rms_px=0.25, views=20
+    )
+
+    write_intrinsics(tmp_path / "i.json", made)
+
+    assert read_intrinsics(tmp_path / "i.json") == made
 
 
 def _of_another_size(folder: Path) -> None:
@@ -272,3 +298,13 @@ def test_a_source_that_cannot_be_used_is_refused_in_one_line(
 
     assert refused.value.hint
     assert "\n" not in refused.value.message
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+
+    with pytest.raises(MissingExtra) as missing:
+        open_camera("realsense")
+
+    assert isinstance(missing.value, RsePfError)
+    assert "rse-pf[realsense]" in missing.value.hint

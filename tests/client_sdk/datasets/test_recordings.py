@@ -167,6 +167,27 @@ def test_depth_in_the_wrong_unit_is_noticed(tmp_path: Path):
         list(open_dataset(write_tum(tmp_path / "x", [0.0], scale=1)))
 
 
+def test_raw_depth_becomes_metres(tmp_path: Path):
+    raw = np.array([[0, 600, 741, 1057, 1058, 2047]], np.uint16)
+    # 351.3 / 492.5, 351.3 / 351.5, 351.3 / 35.5; 1058 would be 10.18 m, 2047 is "no reading"
+    (tmp_path / "d.pgm").write_bytes(b"P5\n6 1\n65535\n" + raw.astype("<u2").tobytes())
+    depth_m = nyu.read_raw_depth(tmp_path / "d.pgm")
+    np.testing.assert_allclose(depth_m, [[0, 0.713299, 0.999431, 9.895775, 0, 0]], atol=1e-5)
+
+
+def test_depth_is_registered_where_the_colour_camera_sees_it():
+    depth_m = np.zeros((480, 640), np.float32)
+    depth_m[238, 313] = 2.0
+
+    registered = nyu.register_depth(depth_m)
+
+    # Nearly on the depth camera's axis: x = -0.0002 + R[0,2] z - 0.0250 = -0.0338 and
+    # y = -0.0015 + 0.0073 + 0.0003 = 0.0061, so column 325.58 - 518.86 * 0.0338 / 2 = 316.8
+    # and row 253.74 + 519.47 * 0.0061 / 2 = 255.3
+    assert np.argwhere(registered > 0).tolist() == [[255, 317]]
+    assert registered[255, 317] == pytest.approx(1.999, abs=0.001)
+
+
 # --- NYU Depth V2 -------------------------------------------------------------------------------
 
 
@@ -245,6 +266,18 @@ def test_an_image_of_another_size_than_the_camera_is_refused(
     assert "intrinsics.json" in told.value.hint
 
 
+def test_intrinsics_that_are_named_count_before_those_of_the_folder(tmp_path: Path):
+    folder = write_tum(tmp_path / "x", [0.0])
+    own = json.loads((folder / "intrinsics.json").read_text())
+    named = tmp_path / "named.json"
+    named.write_text(json.dumps({**own, "fx": own["fx"] + 7, "depth_scale": 2 * own["depth_scale"]}))
+
+    before, after = open_dataset(folder), open_dataset(folder, intrinsics=named)
+
+    assert after.camera.fx == before.camera.fx + 7
+    assert np.array_equal(2 * next(iter(after)).depth_m, next(iter(before)).depth_m)
+
+
 def test_named_intrinsics_of_a_folder_with_depth_say_its_scale(tmp_path: Path):
     folder = write_tum(tmp_path / "x", [0.0])
     own = json.loads((folder / "intrinsics.json").read_text())
@@ -277,6 +310,17 @@ def test_a_unit_of_depth_that_is_assumed_has_narrow_limits(
             open_dataset(folder)
     else:
         assert open_dataset(folder).has_depth
+
+
+def test_colour_images_without_depth_are_left_out_and_counted(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "drive", [0.0, 0.1, 0.2, 0.3, 0.4])
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(lines[:-2]) + "\n")
+
+    dataset = open_dataset(folder)
+
+    assert len(dataset) == 3
+    assert dataset.log.doubts[0].sentence.startswith("2 of 5 colour images")
 
 
 def test_assumed_intrinsics_are_reported(tmp_path: Path):

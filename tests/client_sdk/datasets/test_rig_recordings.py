@@ -147,6 +147,33 @@ def test_frames_carry_the_imu_since_the_frame_before(tmp_path: Path) -> None:
     np.testing.assert_allclose(model.T_imu_camera, inverse(T_BI) @ dataset.T_body_camera, atol=1e-9)
 
 
+def test_left_images_without_a_right_one_are_left_out_and_counted(tmp_path: Path) -> None:
+    folder = write_right_and_imu(write_euroc(tmp_path / "MH_01"))
+    data = folder / "mav0/cam1/data.csv"
+    lines = data.read_text().splitlines()
+    data.write_text("\n".join([lines[0], *lines[2:]]))
+
+    dataset = open_euroc(folder)
+
+    assert (len(dataset), len(open_euroc(folder, camera="left"))) == (2, 3)
+    (doubt,) = dataset.log.doubts
+    assert doubt.sentence == "1 of 3 images of MH_01's left camera have no right one, and are left out"
+    assert [int(frame.rgb[24, 32, 0]) for frame in dataset] == [10, 20]
+
+
+def test_what_a_recording_has_not_is_said_by_the_option(tmp_path: Path) -> None:
+    euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
+
+    with pytest.raises(UsageError, match="has no cam1"):
+        open_dataset(euroc, camera="stereo")
+    with pytest.raises(UsageError, match="has no imu0"):
+        open_dataset(euroc, imu=True)
+    with pytest.raises(UsageError, match="has no image_1"):
+        open_dataset(kitti, camera="stereo")
+    with pytest.raises(UsageError, match="has no IMU"):
+        open_dataset(kitti, imu=True)
+
+
 def test_the_right_camera_of_kitti_sits_to_the_right(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "06")
     (folder / "image_1").mkdir()
@@ -178,6 +205,15 @@ def test_kitti_gives_the_left_camera_and_its_poses(tmp_path: Path, is_apart: boo
     assert dataset.truth is not None
     assert dataset.truth.positions.tolist() == [[0, 0, 5], [1, 0, 5], [2, 0, 5]]
     assert dataset.T_body_camera is None
+
+
+def test_recordings_without_truth_are_read(tmp_path: Path) -> None:
+    euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
+    (euroc / "mav0/state_groundtruth_estimate0/data.csv").unlink()
+    (kitti / "poses.txt").unlink()
+
+    assert (open_euroc(euroc).truth, open_euroc(euroc).truth_kind) == (None, "none")
+    assert open_kitti(kitti).truth is None
 
 
 @pytest.mark.parametrize(

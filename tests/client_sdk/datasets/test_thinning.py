@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from client_sdk.datasets.thinning import Thinning, median_interval_s
+from rse_pf.errors import UsageError
 
 RATE_HZ = 30.0
 
@@ -72,3 +73,9 @@ def test_a_camera_at_the_own_rate_loses_no_frame_of_a_tenth_of_jitter() -> None:
     stamps = jittered(3, jitter=0.1)
 
     assert played(stamps, 30.0, is_known=False) == list(stamps)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
+    with pytest.raises(UsageError, match="not above 0"):
+        Thinning(rate_hz)

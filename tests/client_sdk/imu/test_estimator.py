@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from client_sdk.imu.estimator import ImuEstimator, ImuScale
+from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.geometry import Array, Camera, exp_se3, exp_so3, inverse, rotation_angle_deg
 from rse_pf.slam.inertial import upright_rotation
@@ -183,6 +183,13 @@ def test_an_inverted_mounting_is_reported():
     made = driven(change=lambda s: replace(s, model=replace(MODEL, T_imu_camera=inverse(MODEL.T_imu_camera))))
 
     assert "T_imu_camera says" in made.inertial.trouble
+
+
+def test_the_world_of_a_level_camera_has_z_up_and_x_ahead():
+    T = level_start_pose(np.array([0.0, 1.0, 0.0]))
+
+    np.testing.assert_allclose(T[:3, 2], [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(T[:3, 1], [0.0, 0.0, -1.0], atol=1e-12)
 
 
 def test_gravity_points_down_after_the_correction():

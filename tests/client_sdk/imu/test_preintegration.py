@@ -8,6 +8,7 @@ import pytest
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.preintegration import preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
+from rse_pf.errors import UsageError
 from rse_pf.geometry import exp_se3, log_so3
 from tests.kit.inertial_drive import GRAVITY, InertialDrive, Motion, SimulatedImu
 
@@ -82,6 +83,12 @@ def test_the_covariance_is_that_of_many_noisy_measurements():
         runs.append(errors_between(made, preintegrate(noisy, np.zeros(3), np.zeros(3))))
     measured = np.sqrt(np.diag(np.cov(np.array(runs).T)))
     np.testing.assert_allclose(np.sqrt(np.diag(made.covariance)), measured, rtol=0.15)
+
+
+def test_one_sample_is_no_interval():
+    one = ImuSamples(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)), MODEL)
+    with pytest.raises(UsageError, match="1 IMU samples"):
+        preintegrate(one, np.zeros(3), np.zeros(3))
 
 
 def test_the_history_gives_no_interval_with_missing_samples():

@@ -99,6 +99,10 @@ def test_a_turn_or_a_tiny_step_is_no_start(twist: list[float], why: str) -> None
     assert why in start_from_two_views(pixels[0], second, CAMERA).reason
 
 
+def test_too_few_matches_are_no_start() -> None:
+    assert "only 5 matches" in start_from_two_views(np.zeros((5, 2)), np.zeros((5, 2)), CAMERA).reason
+
+
 def test_triangulates_and_refuses_what_disagrees() -> None:
     world, poses, pixels = scene()
     second = pixels[4].copy()

@@ -35,3 +35,9 @@ def changed(values: Array, row: int, value: float) -> Array:
 def test_a_track_that_cannot_be_searched_is_refused(times_s: Array, gyro: Array, sentence: str) -> None:
     with pytest.raises(UsageError, match=sentence):
         ImuTrack(times_s, gyro, RATES, MODEL)
+
+
+def test_a_frame_takes_one_sample_before_and_one_after_its_interval() -> None:
+    samples = ImuTrack(TIMES_S, RATES, RATES, MODEL).between(0.15, 0.25)
+
+    assert samples.timestamps_s.tolist() == pytest.approx([0.1, 0.2, 0.3])

@@ -77,6 +77,19 @@ def test_every_ray_ends_on_a_surface_of_the_world(renderer: Renderer):
     assert (points < [3 * ROOM_M + 0.001, DEPTH_M + 0.001, HEIGHT_M + 0.001]).all()
 
 
+def test_the_depth_of_a_wall_is_exact(renderer: Renderer):
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, 0, -1], [1, 0, 0], [0, -1, 0]]  # looking along -x; x of the image is +y
+    pose[:3, 3] = [1.0, 1.5, 0.5]
+
+    _, depth_m, cosine = renderer.draw(pose)
+
+    assert depth_m[240, 320] == pytest.approx(1.0, abs=1e-5)
+    assert cosine[240, 320] == pytest.approx(1.0, abs=1e-4)
+    # the floor, 0.5 m below: row 239.5 + 525 * 0.5 / z, so at row 449 z = 0.5 * 525 / 209.5
+    assert depth_m[449, 320] == pytest.approx(0.5 * 525 / 209.5, abs=1e-4) or depth_m[449, 320] < 1.0001
+
+
 def test_depth_noise_has_the_size_that_the_model_says():
     rng = np.random.default_rng(0)
     for z in (1.0, 2.0, 4.0):
@@ -90,6 +103,27 @@ def test_depth_noise_has_the_size_that_the_model_says():
         assert np.std(errors[seen] - z) == pytest.approx(sigma, rel=0.05)
         assert abs(np.mean(errors[seen]) - z) < 0.05 * sigma + step**2
         assert 0.001 < 1 - seen.mean() < 0.003
+
+
+def test_depth_has_holes_at_edges_at_grazing_angles_and_out_of_range():
+    truth = np.full((100, 100), 2.0, np.float32)
+    truth[:, 50:] = 3.0
+    truth[0], truth[1] = 0.39, 6.1
+    cosine = np.ones_like(truth)
+    cosine[60] = 0.05
+
+    seen = add_depth_noise(truth, cosine, np.random.default_rng(0)) > 0
+
+    assert not seen[[0, 1, 60]].any()
+    assert not seen[3:59, 50:53].any()  # the shadow of the nearer surface
+    assert seen[3:59, :50].mean() > 0.99
+    assert seen[3:59, 53:].mean() > 0.99
+
+
+def test_robots_that_do_not_exist_are_refused():
+    for arguments in ((3, 3, 10, 0), (-1, 3, 10, 0), (0, 1, 0, 0)):
+        with pytest.raises(UsageError):
+            next(render_frames(*arguments))
 
 
 @pytest.mark.slow
