@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import client_sdk
-from client_sdk.bags import BagWriter
+from client_sdk.bags import BagKind, BagWriter
 from client_sdk.bags.bag_file import open_bag_file
-from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, TF
-from client_sdk.trajectory import read_trajectory
+from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, PATH, POINT_CLOUD, POSE, TF
+from client_sdk.point_map import write_ply
+from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.cli.main import main
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
@@ -101,6 +102,34 @@ def test_a_bag_becomes_a_map_with_its_error_against_tf(
     assert len(read_trajectory(Path("out-bag/trajectory.txt"))) == 6
     assert {"map.ply", "map.png"} <= {each.name for each in Path("out-bag").iterdir()}
     assert "colour: /cam/image, rgb8, 6 messages" in out
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_results_become_a_bag_of_poses_path_and_cloud(folder: Path, kind: BagKind) -> None:
+    Path("out").mkdir()
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = (0.0, 1.0, 2.0)
+    write_trajectory(Path("out/trajectory.txt"), Trajectory(np.array([10.0, 10.5, 11.0]), poses))
+    points = np.array([[1, 2, 3], [4, 5, 6]], dtype=np.float32)
+    write_ply(Path("out/map.ply"), points, np.array([[255, 1, 2], [3, 4, 5]], dtype=np.uint8))
+    file = {"ros1": "map.bag", "sqlite3": "map.db3", "mcap": "map.mcap"}[kind]
+
+    assert main(["map", "to-bag", "out", "--out", file]) == 0
+
+    with open_bag_file(Path(file)) as bag:
+        counts = {topic.name: (topic.kind, topic.messages) for topic in bag.topics}
+        assert counts == {
+            "/robot/pose": (POSE, 3), "/robot/path": (PATH, 1), "/tf": (TF, 3), "/map": (POINT_CLOUD, 1)
+        }  # fmt: skip
+        seen = [bag.parse(raw) for raw in bag.messages(["/robot/pose"])]
+        assert [each.pose.position.x for each in seen] == [0.0, 1.0, 2.0]
+        assert [raw.log_ns for raw in bag.messages(["/robot/pose"])] == [10 * 10**9, 105 * 10**8, 11 * 10**9]
+        (cloud,) = [bag.parse(raw) for raw in bag.messages(["/map"])]
+        rows = cloud.data.view([("xyz", "<f4", (3,)), ("rgb", "<u4")])
+        assert np.array_equal(rows["xyz"], points)
+        assert rows["rgb"].tolist() == [0xFF0102, 0x030405]
+    assert main(["map", "to-bag", "out", "--out", file]) == 2  # it is there already
+    assert not list(Path().glob(".bag-*"))
 
 
 def test_a_version_of_a_map_is_exported_as_mcap(folder: Path) -> None:

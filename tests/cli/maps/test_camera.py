@@ -14,7 +14,7 @@ from client_sdk.cameras.board import Board, find_corners
 from client_sdk.cameras.calibration import BoardViews, calibrate
 from client_sdk.rigs.rig_file import read_intrinsics
 from rse_pf.cli.main import main
-from rse_pf.errors import CommandFailed
+from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, transform
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -105,6 +105,15 @@ def test_refuses_too_few_views_views_that_are_alike_and_large_errors(tmp_path: P
         calibrate(good, max_rms_px=0.001)
 
 
+def test_the_same_view_twice_counts_once() -> None:
+    views = BoardViews(BOARD)
+
+    assert [views.add(view(poses(1)[0])) for _ in range(3)] == [True, False, False]
+    assert (views.images, views.similar) == (3, 2)
+    with pytest.raises(UsageError, match="160x120 px"):
+        views.add(np.zeros((120, 160), np.uint8))
+
+
 def test_the_pdf_has_the_true_size(tmp_path: Path) -> None:
     assert (
         main(["camera", "board", "--board", "7x5", "--square-mm", "30", "--out", str(tmp_path / "b.pdf")])
@@ -155,3 +164,20 @@ def test_check_says_size_rate_depth_and_blur(tmp_path: Path, capsys: pytest.Capt
         0,
     )
     assert "3 of the first 3 frames are blurred or empty: frames 1-3" in out
+
+
+def test_check_says_that_a_recording_has_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kitti = tmp_path / "06"
+    for camera in ("image_0", "image_1"):
+        (kitti / camera).mkdir(parents=True)
+        for row in range(3):
+            cv2.imwrite(str(kitti / camera / f"{row:06}.png"), np.full((48, 64), 128, np.uint8))
+    (kitti / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    (kitti / "calib.txt").write_text("P0: 60 0 32 0 0 60 24 0 0 0 1 0\nP1: 60 0 32 -30 0 60 24 0 0 0 1 0\n")
+
+    main(["camera", "check", str(kitti)])
+    main(["camera", "check", str(kitti), "--json"])
+
+    line, _, figures = capsys.readouterr().out.splitlines()
+    assert line.endswith("64x48 px, 10.0 frames per second, a stereo pair")
+    assert (json.loads(figures)["with_stereo"], json.loads(figures)["with_depth"]) == (3, 0)

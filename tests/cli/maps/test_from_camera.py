@@ -124,6 +124,20 @@ def test_a_recording_with_true_poses_tells_the_error_of_the_path(
     assert f"error beside the ground truth: ATE {report['ate_cm']:.2f} cm" in out
 
 
+def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = Trajectory(np.arange(6) * 0.1, np.tile(np.eye(4), (6, 1, 1)))
+    write_tum(folder / "drive", [frame_at(row, depth=True) for row in range(6)], truth)
+    cv2.imwrite("drive/rgb/004.png", np.zeros((24, 32, 3), np.uint8))
+
+    code = main(["map", "from-camera", "drive", *PLATFORM, "--out", "out"])
+
+    shown = capsys.readouterr()
+    assert code == 1
+    assert "finding ended-early: the source failed after 4 frames, which are kept" in shown.out
+    assert "is 32x24 px, the camera of the recording 320x240 px" in shown.err
+    assert len(read_trajectory(folder / "out/trajectory.txt")) == 4
+
+
 def test_a_map_above_the_quota_of_its_tenant_is_not_kept_and_the_drive_is(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -166,6 +180,46 @@ def test_the_hint_of_a_lost_drive_names_what_its_images_show(
     assert hint in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_a_path_without_scale_has_no_error_in_centimetres(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 0, 3] = STEP_M * np.arange(9)
+    frames = [frame_at(row, depth=True) for row in range(9)]
+    write_tum(folder / "drive", frames, Trajectory(np.array([f.timestamp_s for f in frames]), poses))
+
+    code = main(["map", "from-camera", "drive", "--no-depth", *PLATFORM])
+
+    out = capsys.readouterr().out
+    report = json.loads(Path("out-camera/report.json").read_text())
+    assert code == 0, out
+    assert report["unit"] != "m"
+    assert [report[name] for name in ("path_m", "ate_cm", "rpe_cm")] == [None, None, None]
+    assert "error beside" not in out
+
+
+def test_several_addresses_are_given_to_the_robot_which_takes_the_nearest(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["v.avi", "--intrinsics", "i.json", "--frames", "7", "--url", "ws://q/ws", *PLATFORM]
+
+    assert main(["map", "from-camera", *words]) == 0, capsys.readouterr().out
+
+    assert Path("addresses").read_text() == "ws://q/ws ws://p/ws"
+
+
+def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["map", "from-camera", "v.avi", "--intrinsics", "i.json", "--frames", "7", *PLATFORM])
+
+    out = capsys.readouterr().out
+    assert code == 0
+    assert "units; scale: up to scale" in out
+    assert json.loads(Path("out-camera/report.json").read_text())["scale"] == "up to scale"
+    assert "metres" not in Path("out-camera/trajectory.txt").read_text()
+    assert b"comment up to scale" in Path("out-camera/map.ply").read_bytes()[:200]
+    assert len(read_ply(Path("out-camera/map.ply"))[0]) > 100
+
+
 def test_each_frame_has_a_row_that_says_why_it_has_no_pose(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -200,6 +254,20 @@ def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
     assert lines[0].startswith("frame 1: first, ")
+
+
+def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    writer = cv2.VideoWriter("still.avi", cv2.VideoWriter_fourcc(*"FFV1"), 10.0, (320, 240))
+    for _ in range(3):
+        writer.write(frame_at(0, depth=False).rgb)
+    writer.release()
+
+    code = main(["map", "from-camera", "still.avi", "--intrinsics", "i.json", *PLATFORM])
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert "3 of 3 frames have no pose in the map" in error
+    assert "must move, not only turn" in error
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,15 @@ def test_photos_are_sent_with_the_lens_and_each_has_a_line(
     assert lens == PhotoLens(**CALIBRATED, distortion=(0.1, -0.2, 0.0, 1e-5, 0.3))
 
 
+def test_json_has_the_pose_with_its_quality(platform: Platform, capsys: pytest.CaptureFixture[str]) -> None:
+    assert platform.run("kitchen", "known.jpg", "--camera", "500,500,320,240", "--json") == 0
+
+    (found,) = json.loads(capsys.readouterr().out)
+    assert found["T_map_camera"] == POSE
+    assert (found["position_sigma_m"], found["turn_sigma_deg"], found["version"]) == (0.01, 0.2, "ab")
+    assert platform.localiser.asked[0][2] == PhotoLens(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+
+
 def test_the_exit_code_is_1_if_no_photo_is_found(platform: Platform) -> None:
     assert platform.run("kitchen", "strange.jpg", "--camera", "500,500,320,240") == 1
 
@@ -119,3 +128,13 @@ def test_what_cannot_work_is_one_line_with_a_hint(
     assert said in told
     assert "hint: " in told
     assert "Traceback" not in told
+
+
+def test_options_of_a_platform_need_its_address(
+    platform: Platform, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", "localise", "kitchen", "known.jpg", "--url", platform.server.url]) == 2
+    assert "--camera" in capsys.readouterr().err
+    words = ["map", "localise", "kitchen", "known.jpg", "--intrinsics", "x", "--store", "dir:."]
+    assert main(words) == 2
+    assert "add --url" in capsys.readouterr().err

@@ -52,6 +52,17 @@ def asked(capsys: pytest.CaptureFixture[str], store: Path, *words: str) -> objec
     return json.loads(capsys.readouterr().out)
 
 
+def test_diff_rollback_and_show_all_agree(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    versions = asked(capsys, store, "show", "hall", "--all")
+    first, second = (each["id"] for each in versions)  # type: ignore[attr-defined]
+    assert asked(capsys, store, "diff", "hall", first[:8])["added"] == [2]  # type: ignore[index]
+
+    assert asked(capsys, store, "rollback", "hall", first[:8]) == {"was": second, "head": first}
+
+    again = asked(capsys, store, "show", "hall", "--all")
+    assert [each["head"] for each in again] == [True, False]  # type: ignore[attr-defined]
+
+
 def test_prune_removes_old_versions_and_says_how_many_bytes_are_free(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

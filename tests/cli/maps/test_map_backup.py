@@ -92,6 +92,39 @@ def test_maps_of_one_tenant_are_restored_with_all_versions_elsewhere(
     assert "0 versions written" in run(capsys, "map restore acme.maps --tenant acme --name lab")
 
 
+def test_lost_versions_come_back_and_later_ones_stay(capsys: Capture, store: DirectoryStore) -> None:
+    maps = MapRegistry(store, "acme")
+    old = maps.head("hall")
+    run(capsys, "map backup acme.maps --tenant acme")
+    store.delete(maps.blob_name("attic", maps.head("attic")))
+    for info in list(store.list("maps/acme/attic/")):
+        store.delete(info.name)
+    newer = commit(store, "hall", 5)
+    before = contents(store)
+
+    problem = refused(capsys, "map restore acme.maps --tenant acme")
+    assert "maps exist and have another head: hall" in problem
+    assert "--overwrite" in problem
+    assert contents(store) == before
+    run(capsys, "map restore acme.maps --tenant acme --overwrite")
+
+    assert maps.head("hall").id == old.id
+    assert maps.data("hall", newer)
+    assert maps.data("attic")
+
+
+def test_a_head_whose_record_was_lost_is_replaced(capsys: Capture, store: DirectoryStore) -> None:
+    maps = MapRegistry(store, "acme")
+    old = maps.head("hall").id
+    run(capsys, "map backup acme.maps --tenant acme")
+    lost = commit(store, "hall", 5)
+    store.delete(next(info.name for info in store.list() if info.name.endswith(f"versions/{lost}")))
+
+    run(capsys, "map restore acme.maps --tenant acme --overwrite")
+
+    assert maps.head("hall").id == old
+
+
 def test_maps_in_a_bucket_are_backed_up_and_restored(capsys: Capture, cloud: Any) -> None:
     bucket = S3Store(cloud, "maps")
     commit(bucket, "hall", 1)
@@ -104,6 +137,20 @@ def test_maps_in_a_bucket_are_backed_up_and_restored(capsys: Capture, cloud: Any
     assert "2 versions written" in run(capsys, "map restore acme.maps --tenant acme --store s3:maps")
 
     assert [(info.name, bucket.get(info.name)) for info in bucket.list("maps/")] == before
+
+
+def test_a_damaged_version_is_repaired(capsys: Capture, store: DirectoryStore) -> None:
+    maps = MapRegistry(store, "acme")
+    record = maps.head("hall")
+    run(capsys, "map backup acme.maps --tenant acme")
+    whole = store.get(maps.blob_name("hall", record))
+    store.put(maps.blob_name("hall", record), whole[:-1])
+
+    assert "is damaged" in refused(capsys, "map backup damaged.maps --tenant acme")
+    assert not Path("damaged.maps").exists()
+    assert "1 version written" in run(capsys, "map restore acme.maps --tenant acme")
+
+    assert maps.data("hall") == whole
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
@@ -119,6 +166,21 @@ def test_a_file_that_was_cut_off_restores_nothing(
         capsys, "map restore acme.maps --tenant acme --name lab"
     )
     assert list(lab.list()) == []
+
+
+def test_a_file_that_was_changed_restores_nothing(
+    capsys: Capture, store: DirectoryStore, lab: DirectoryStore
+) -> None:
+    run(capsys, "map backup acme.maps --tenant acme --name default")
+    whole = Path("acme.maps").read_bytes()
+    for at in range(600, len(whole), len(whole) // 40):
+        if not whole[at]:
+            continue  # padding
+        Path("acme.maps").write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        code = main(["map", "restore", "acme.maps", "--tenant", "acme", "--name", "lab"])
+        error = capsys.readouterr().err
+        assert (code, len(error.splitlines())) == (2, 2), (at, error)
+        assert list(lab.list()) == [], at
 
 
 def archive_of(members: dict[str, bytes]) -> bytes:

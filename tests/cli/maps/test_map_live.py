@@ -56,3 +56,8 @@ def test_show_reads_the_log_and_takes_no_lease(store: Path, capsys: pytest.Captu
     shown = json.loads(capsys.readouterr().out)
     assert (shown["state"], shown["keyframes"], shown["version"]) == ("idle", 0, 1)
     assert (store / "live/default/hall/lease").read_bytes() == lease
+
+
+def test_a_map_that_was_stopped_is_not_shown(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(store, "live", "show", "attic") == 1
+    assert "live map 'attic' was stopped" in capsys.readouterr().err

@@ -53,6 +53,46 @@ def test_merge_makes_one_map_and_names_what_was_joined(
     assert any(edge.kind == "merge" for edge in version.edges)
 
 
+def test_merging_into_an_existing_map_adds_a_version_after_its_head(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(store, "merge", "a", "b", "--into", "a") == 0
+
+    records = MapRegistry(DirectoryStore(store)).versions("a")
+    assert [each.number for each in records] == [1, 2]
+    assert records[1].parent == records[0].id
+    assert records[1].note == "merged a, b"
+
+
+def test_maps_that_were_not_joined_are_named_and_the_exit_code_is_1(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(store, "merge", "a", "b", "c", "--into", "hall", "--json") == 1
+
+    made = json.loads(capsys.readouterr().out)
+    assert made["joined"] == ["a", "b"]
+    assert [each["map"] for each in made["not_joined"]] == ["c"]
+    assert made["not_joined"][0]["reason"]
+
+
+def test_maps_that_cannot_be_joined_write_nothing(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(store, "merge", "a", "c", "--into", "hall") == 1
+
+    said = capsys.readouterr().err
+    assert "nothing was written" in said
+    assert "hint:" in said
+    assert "hall" not in MapRegistry(DirectoryStore(store)).names()
+
+
+def test_an_older_version_can_be_merged(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maps = MapRegistry(DirectoryStore(store))
+    first = maps.head("a")
+    strange = make_world(2).walk("robot-a", np.linspace(0.0, 0.3, 8), seed=3)[0]
+    maps.commit("a", encode_map(strange), parent=first.id, author="a", created_s=2e9)
+
+    assert run(store, "merge", f"a@{first.id[:8]}", "b", "--into", "hall") == 0
+
+
 SHIFT_PX = 16
 """The camera moves to the right by so many pixels, in front of a wall."""
 
@@ -122,3 +162,22 @@ def test_localise_prints_a_line_for_each_frame_and_exits_with_1_if_none_has_a_po
     assert lines[2] == "1 of 2 found"
 
     assert run(store, "localise", "room", str(tmp_path / "noise.png")) == 1
+
+
+def test_an_image_of_another_size_needs_its_camera(
+    rendered: tuple[Path, np.ndarray, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    store, _, image = rendered
+    with Image.open(image) as whole:
+        whole.resize((320, 240)).save(tmp_path / "small.png")
+
+    assert run(store, "localise", "room", str(tmp_path / "small.png")) == 2
+    assert "--camera fx,fy,cx,cy" in capsys.readouterr().err
+    assert run(store, "localise", "room", str(tmp_path / "small.png"), "--camera", "1,2,x") == 2
+
+    assert (
+        run(store, "localise", "room", str(tmp_path / "small.png"), "--camera", "262.5,262.5,159.5,119.5")
+        == 0
+    )

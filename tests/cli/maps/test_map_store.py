@@ -107,6 +107,39 @@ def test_images_of_keyframes_are_kept_if_asked_for_and_exported_with_the_map(
     assert not Path("bare/images").exists()
 
 
+def test_a_map_up_to_scale_is_not_kept_and_the_report_says_why(
+    video_folder: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["v.avi", "--intrinsics", "i.json", "--frames", "7", *PLATFORM]
+
+    assert main(["map", "from-camera", *words]) == 0
+
+    assert report_of("out-camera")["map"] is None
+    assert report_of("out-camera")["map_reason"] == "its scale is not known"
+    assert "not in a store: its scale is not known" in capsys.readouterr().out
+    assert MapRegistry(DirectoryStore(state_home / "rse-pf/default/objects")).names() == []
+
+
+def test_a_second_drive_is_the_next_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        assert main(["map", "from-bag", "drive.bag", "--map", "hall", *PLATFORM]) == 0
+
+    assert main(["map", "show", "hall", "--json"]) == 0
+    shown = json.loads(last_json(capsys))
+    assert (shown["number"], shown["author"]) == (2, "rse-pf map from-bag")
+
+
+def test_a_drive_is_kept_for_the_tenant_that_is_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["map", "from-bag", "drive.bag", "--map", "hall", "--tenant", "acme", *PLATFORM]
+    assert main(words) == 0
+    assert "see rse-pf map show hall --tenant acme" in capsys.readouterr().out
+
+    assert main(["map", "show", "hall", "--tenant", "acme"]) == 0
+    assert main(["map", "show", "hall"]) == 1
+
+
 def test_the_store_of_the_one_platform_that_runs_is_found(
     tmp_path: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
