@@ -60,3 +60,13 @@ def test_a_canary_whose_secret_is_gone_is_not_enrolled(
 
     assert "put_secret_value: it does not exist" in capsys.readouterr().err
     assert AccessControlStore(S3Store(account.client("s3"), "artifacts")).roster().robots == ()
+
+
+def test_a_canary_that_is_off_is_not_enrolled(
+    account: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    context = {"rse-pf": {"cloud": {"canary": False}}}
+    (tmp_path / "cdk.json").write_text(json.dumps({"context": context}), encoding="utf-8")
+
+    assert main(["cloud", "canary"]) == 2
+    assert "cloud.canary is off" in capsys.readouterr().err

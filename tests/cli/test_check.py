@@ -41,6 +41,14 @@ def test_what_is_certain_corrects_the_intrinsics_and_nothing_else_does() -> None
     assert len(changes) == 2
 
 
+def test_distortion_is_not_added_to_that_of_a_lens() -> None:
+    bent = Intrinsics(camera=CAMERA, distortion=(0.1, 0.0, 0.0, 0.0))
+    found = [finding(FaultKind.DISTORTION, -0.1, k1=-0.1)]
+
+    assert corrected(bent, found) == (bent, ())
+    assert corrected(Intrinsics(camera=CAMERA), found)[0].distortion[0] == -0.1
+
+
 def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
     check = DriveCheck(is_wanted=True)
     check.add(None, None)  # type: ignore[arg-type]  # a frame that it cannot read
@@ -49,6 +57,15 @@ def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.
     (line,) = check.lines(told)
     assert line.startswith("check: it failed (AttributeError")
     assert "--no-check" in line
+
+
+def test_results_of_a_map_say_what_was_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "trajectory.txt").write_text("# none\n")
+    report = {"findings": [finding(FaultKind.BLUR, 0.5).to_dict()], "cannot_tell": [], "frames": 9}
+    (tmp_path / "report.json").write_text(json.dumps({"frames": 9, "check": report}))
+
+    assert main(["check", str(tmp_path)]) == 1
+    assert "it is off" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

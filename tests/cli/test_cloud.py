@@ -61,6 +61,36 @@ def test_the_bill_adds_up_line_by_line_and_box_by_box(capsys: pytest.CaptureFixt
     assert f"{total / (20 * 730 / 3):.4f} USD" in page, "a robot for an hour"
 
 
+def test_a_file_of_prices_replaces_ours(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    chosen = {"lambda_per_million": 1e6, "firewall_per_million": 0, "as_of": "2026-01-31", "currency": "EUR"}
+    (tmp_path / "prices.json").write_text(json.dumps(chosen), encoding="utf-8")
+
+    assert main(["cloud", "cost", "--prices", "prices.json", "--robots", "1", "--fps", "1"]) == 0
+
+    page = capsys.readouterr().out
+    assert "prices of 2026-01-31" in page
+    assert "EUR/month" in page
+    assert f"{730 * 3600}." in page, "one for each command"
+
+
+def test_a_type_without_a_price_is_one_line_and_a_hint(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    document = {"context": {"rse-pf": {"cloud": {"instance_type": "z1d.large"}}}}
+    (tmp_path / "mine.json").write_text(json.dumps(document), encoding="utf-8")
+
+    assert main(["cloud", "--settings", str(tmp_path / "mine.json"), "cost"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("ConfigurationError: no price of z1d.large is known")
+    assert "prices.json" in lines[1]
+
+
+def test_a_load_beyond_the_settings_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["cloud", "cost", "--robots", "10000", "--fps", "30"]) == 0
+
+    assert "robots would be refused" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("action", ["status", "leftovers"])
 def test_without_credentials_there_is_one_line_and_a_hint(
     capsys: pytest.CaptureFixture[str], nobody: None, action: str
@@ -187,6 +217,19 @@ def test_the_status_of_a_well_fleet(
     assert "1 server, wanted 1 of 1 to 4" in page
     assert "7 robots on 1 server, 7 to 7 on each" in page
     assert "alarm idle         OK\n" in page
+
+
+def test_servers_that_reported_no_robots_are_not_counted_as_empty(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = (server("i-1"), server("i-2", robots=None))
+    show(
+        monkeypatch, AutoScalingGroup(min_servers=1, wanted_servers=2, max_servers=4, servers=both, alarms={})
+    )
+
+    assert main(["cloud", "status"]) == 0
+
+    assert "7 robots on 1 of 2 servers, 7 to 7 on each" in capsys.readouterr().out
 
 
 def test_the_status_of_an_ill_fleet_leads_to_the_runbook(

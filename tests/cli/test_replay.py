@@ -81,6 +81,17 @@ def test_replay_lists_what_went_wrong_worst_first(
 
 
 @pytest.mark.usefixtures("quick")
+def test_json_of_a_recording_has_the_counts_and_the_troubles(
+    recording: tuple[Path, dict[str, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = as_json(capsys, recording[0])
+
+    assert (seen["commands"], seen["equal"], seen["different"]) == (3, 3, 0)
+    assert seen["by_kind"] == {"failed": 1, "weak": 1}
+    assert [each["id"] for each in seen["troubles"]] == [recording[1]["failed"], recording[1]["weak"]]
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_command_is_shown_with_its_evidence_and_on_a_page(
     recording: tuple[Path, dict[str, str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -62,6 +62,24 @@ def test_the_file_holds_address_authority_and_the_key_that_the_roster_knows(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        ("", "only this machine reaches that address"),
+        (" --url ws://platform.example:8700/ws", "clear text"),
+        (" --url wss://platform.example/ws", "again with --authority"),
+    ],
+)
+def test_an_address_that_robots_elsewhere_cannot_use_is_reported(
+    platform: Path, capsys: Capture, words: str, said: str
+) -> None:
+    runs(platform, "ws://127.0.0.1:8700/ws")
+
+    assert main(f"robot enrol robot-1 --out r1.enrolment{words}".split()) == 0
+
+    assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
         ("robot-1 --out r1", "platform 'default' does not run"),
         ("robot-1 --out r1 --url 10.1.2.3", "is not the address of a platform"),
         ("robot-1 --out r1 --url wss://a/ws --authority missing", "cannot read the authority"),

@@ -45,6 +45,17 @@ def events(found: list) -> list[str]:
     return [each.text.split()[0] for each in found]
 
 
+def chosen(folder: Path, **wanted: object) -> list[str]:
+    return events(last_lines(log_files(folder, None), LogFilter(**wanted), 10))
+
+
+def test_lines_of_all_processes_are_in_the_order_of_their_times(folder: Path) -> None:
+    found = last_lines(log_files(folder, None), ALL_LINES, 10)
+
+    assert events(found) == ["server-ready", "command", "a", "[warning]", "defect"]
+    assert events(last_lines(log_files(folder, None), ALL_LINES, 2)) == ["[warning]", "defect"]
+
+
 def test_lines_about_a_server_are_chosen_with_its_own_and_rotated_logs_are_read(folder: Path) -> None:
     (folder / "data-1.log").write_text(line(40, "server-gone", server="server-2"))
     (folder / "server-2.log.1").write_text(line(5, "earlier"))
@@ -59,6 +70,14 @@ def test_a_line_shows_its_fields_and_the_end_of_a_traceback(folder: Path) -> Non
 
     assert format_line(found[1])[19:] == '  server-2  debug    command robot="r 1" id=7'
     assert format_line(found[-1]).endswith("error    defect ZeroDivisionError")
+
+
+def test_an_unknown_server_and_an_empty_folder_are_refused_with_what_there_is(folder: Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        log_files(folder, "server-9")
+    assert caught.value.hint == "there are logs of load-balancer, server-1, server-2"
+    with pytest.raises(UsageError, match="no logs"):
+        log_files(folder / "none", None)
 
 
 def test_what_is_appended_is_followed_also_in_a_rotated_and_in_a_new_log(folder: Path) -> None:
@@ -103,6 +122,17 @@ def test_what_the_control_plane_did_is_among_the_lines_with_the_level_of_its_kin
         ("info", "server-healthy server=server-2 pid=7"),
         ("warning", 'server-gone server=server-2 exit_code=-9 cause=""'),
     ]
+
+
+def test_time_robot_and_tenant_choose_lines(with_events: Path) -> None:
+    assert chosen(with_events, since_s=33.0) == ["server-gone", "robot-offline", "robot-online"]
+    assert chosen(with_events, robot="r1", tenant="acme") == ["robot-offline"]
+    assert chosen(with_events, tenant="default", since_s=33.0) == ["server-gone", "robot-online"]
+    many = [line(40 + number / 1e3, "drain") for number in range(200)]
+    (with_events / "server-3.log").write_text("".join(many))
+    assert len(
+        last_lines(log_files(with_events, "server-3"), LogFilter(since_s=40.0, process="server-3"), 10)
+    ) == len(many)
 
 
 def test_events_are_the_lines_that_a_program_can_follow(with_events: Path) -> None:

@@ -125,6 +125,16 @@ def test_status_shows_what_is_refused_to_whom_why_and_for_how_long(capsys, ports
     assert [port.asked for port in ports] == [[f"GET /blocks Bearer {TOKEN}"]] * 2
 
 
+def test_names_that_robots_chose_cannot_control_the_terminal(capsys, ports, platform):
+    ports[0].refuses({**ROBOT, "tenant": "a\x1b[2J", "robot": "r\nserver-9 all is well\u202e"})
+
+    written = told(capsys, "status")
+
+    assert "\x1b" not in written
+    assert "\u202e" not in written
+    assert len(written.splitlines()) == 2
+
+
 @pytest.mark.parametrize(
     ("words", "target"),
     [
@@ -139,6 +149,27 @@ def test_unblock_asks_every_server_for_what_is_named(capsys, ports, platform, wo
     told(capsys, "unblock", *words)
 
     assert [[line.split()[:2] for line in port.asked] for port in ports] == [[["POST", target]]] * 2
+
+
+def test_unblock_says_what_was_lifted_where(capsys, ports, platform):
+    ports[1].refuses(ROBOT)
+    ports[1].answer["count"] = 8
+
+    assert told(capsys, "unblock") == (
+        "server-2: icp is no longer refused to robot acme/robot-1 (overrun deadlines)\nserver-2: and 7 more\n"
+    )
+
+
+def test_a_server_that_does_not_answer_is_named_and_the_others_are_shown(capsys, ports, platform):
+    ports[0].refuses(ALL)
+    ports[0].answer["silent_workers"] = 1
+    ports[1].answer = ["no", "answer"]
+
+    written = told(capsys, "status", code=1)
+
+    assert "pose" in written
+    assert "no answer from server-2" in written
+    assert "no answer from 1 workers of server-1" in written
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,9 @@ def complaint(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return told.err
 
 
+HASH = "--hash=sha256:" + "a" * 64
+
+
 def test_an_unlocked_requirement_is_refused_by_every_action_that_builds(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -55,6 +58,14 @@ def test_an_unlocked_requirement_is_refused_by_every_action_that_builds(
         told = complaint(capsys, action, "mine")
         assert "requirements.txt, line 1: 'tabulate>=0.9' is not locked" in told
         assert "rse-pf service lock" in told
+
+
+def test_packages_are_for_services_in_python(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["service", "new", "mine", "--lang", "lua"])
+    Path("mine/requirements.txt").write_text(f"greeting==1.2 {HASH}\n")
+
+    assert "is for services in Python, mine is in lua" in complaint(capsys, "build", "mine")
+    assert "is for services in Python" in complaint(capsys, "lock", "mine")
 
 
 def test_build_says_what_a_service_runs_with(

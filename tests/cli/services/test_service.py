@@ -38,6 +38,11 @@ def test_new_writes_a_folder_that_is_a_service_with_a_recorded_request(language:
     assert "@NAME@" not in "".join(p.read_text() for p in Path("mine").rglob("*") if p.is_file())
 
 
+@pytest.mark.parametrize("name", ["../up", "Mine", "", "a b", "x" * 41])
+def test_a_name_that_could_be_a_path_is_refused(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert "not a valid service name" in complaint(capsys, "new", name)
+
+
 def test_an_installed_service_is_listed_and_refused_after_a_change(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
