@@ -32,7 +32,7 @@ def test_a_placement_changes_the_settings_of_its_server_and_nothing_else() -> No
 
     placed = placement.apply(SETTINGS)
 
-    assert (placed.serving.port, placed.data.store, placed.live.host) == (0, "dir:/tmp/x", "0.0.0.0")
+    assert (placed.serving.port, placed.data.store, placed.live.host) == (0, "dir:/objects", "0.0.0.0")
     before = {
         "serving": {"port": 9000},
         "data": {"store": SETTINGS.data.store},
