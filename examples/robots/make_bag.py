@@ -20,7 +20,7 @@ IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("bag", type=Path, help="the bag to write")
 parser.add_argument("--recording", type=Path, help="folder of a recording with depth (default: rendered)")
-parser.add_argument("--frames", type=int, default=80, help="at most so many frames (default: 80)")
+parser.add_argument("--frames", type=int, default=80, help="largest number of frames (default: 80)")
 
 
 def image_message(bag: BagWriter, header: Any, image: Any, encoding: str) -> Any:

@@ -79,7 +79,7 @@ class Parser(argparse.ArgumentParser):
     """The words that are parsed."""
 
     siblings: Mapping[str, Parser] = {}
-    """The parsers of all actions of the verb, by name."""
+    """The parsers of the actions of this verb, or of the verb that this action belongs to, by name."""
 
     default_action: str = ""
     """The action that is meant if the first word names none."""
@@ -113,6 +113,12 @@ class Parser(argparse.ArgumentParser):
             options = {*self._option_string_actions, *self._options_of_actions()}
             typed = (each.partition("=")[0] for each in self.typed if each.startswith("--"))
             word = next((each for each in typed if each.strip("-") and each not in options), "")
+        if word in self.siblings:
+            verb = self.prog.rpartition(" ")[0]
+            raise UsageError(
+                f"{self.prog}: {word} is an action, and comes before the options",
+                hint=f"{verb} {word}, then the options; see {verb} {word} --help",
+            )
         if word and not word.startswith("-"):
             raise UsageError(
                 f"{self.prog}: {message}",
@@ -144,6 +150,7 @@ def add_action(parser: Parser, action: Action) -> None:
     parser.default_action = action.default
     parser.epilog = f"{parser.prog} ACTION --help shows the options of an action"
     subparsers = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    parser.siblings = subparsers.choices
     for name, each in action.actions.items():
         made = subparsers.add_parser(
             name,

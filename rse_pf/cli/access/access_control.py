@@ -64,7 +64,8 @@ class PlatformRequest:
         from rse_pf.local.firewall import key_set_file
 
         if not key_set_file(self.folder).exists():
-            known = ", ".join(sorted(each.name for each in self.folder.parent.glob("*/"))) or "none"
+            started = (each.name for each in self.folder.parent.glob("*/") if key_set_file(each).exists())
+            known = ", ".join(sorted(started)) or "none"
             raise UsageError(
                 f"there is no platform {self.name!r}", hint=f"start one with rse-pf local; known: {known}"
             )

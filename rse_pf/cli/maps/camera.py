@@ -29,6 +29,7 @@ from rse_pf.command_line.extras import require
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.storage.files import check_exists
 from rse_pf.terminal import show, show_json, show_progress
 
 if TYPE_CHECKING:
@@ -118,12 +119,24 @@ def write_board_file(request: _WriteRequest, settings: PlatformSettings) -> None
 
 def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> None:
     """Calibrate by views of a board, or by the motion of the camera without a board."""
+    from client_sdk.cameras.open_camera import is_device
+
     has_board = request.board is not None or request.square_mm is not None or request.stereo
     board = request.read_board() if has_board else None
     if not request.max_rms_px > 0:
         raise UsageError(f"--max-rms-px {request.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
     if not request.file.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {request.file.absolute().parent}", hint="create it")
+    for source in request.sources:
+        is_bag = Path(source).suffix in (".bag", ".mcap", ".db3")
+        if is_bag or (source == "realsense" and is_device(source)):
+            verb = "map from-bag" if is_bag else "map from-camera"
+            raise UsageError(
+                f"{source} states its own calibration, and is not calibrated here",
+                hint=f"use rse-pf {verb} {source}, or calibrate a video or a folder of its images",
+            )
+        if not is_device(source) and "://" not in source:
+            check_exists(source, "name a device by its number, a video, images or a recording that exists")
     if board is None:
         _calibrate_from_motion(request)
     elif request.stereo:
@@ -241,19 +254,11 @@ def _raw_pairs(sources: Sequence[str]) -> Iterator[tuple[npt.NDArray[np.uint8], 
 def _raw_images(sources: Sequence[str]) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield grey images as the lens gives them; of a recording those of its first or left camera."""
     from client_sdk.cameras.folder import list_folder
-    from client_sdk.cameras.open_camera import is_device
     from client_sdk.cameras.opencv_video import open_video
     from client_sdk.datasets.images import is_image, read_colour
 
     paths: list[Path] = []
     for word in sources:
-        is_bag = Path(word).suffix in (".bag", ".mcap", ".db3")
-        if is_bag or (word == "realsense" and is_device(word)):
-            verb = "map from-bag" if is_bag else "map from-camera"
-            raise UsageError(
-                f"{word} states its own calibration, and is not calibrated here",
-                hint=f"use rse-pf {verb} {word}, or calibrate a video or a folder of its images",
-            )
         euroc = Path(word) / "mav0" / "cam0" / "data"
         folder = euroc if euroc.is_dir() else Path(word)
         paths += list_folder(folder).images if folder.is_dir() else [folder] if is_image(folder) else []

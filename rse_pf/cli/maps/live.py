@@ -196,31 +196,31 @@ def _read(request: MapRequest, settings: PlatformSettings) -> dict[str, Any]:
 LIVE_ACTIONS = {
     "list": Action(
         help="list the live maps",
-        example="rse-pf map live list --store dir:objects",
+        example="rse-pf map live list",
         request=StoreRequest,
         run=_list,
     ),
     "show": Action(
         help="show the robots and the map server of a live map",
-        example="rse-pf map live show warehouse --store dir:objects",
+        example="rse-pf map live show warehouse",
         request=MapRequest,
         run=_show,
     ),
     "start": Action(
         help="begin a live map, empty or with a version of a map",
-        example="rse-pf map live start warehouse --from warehouse --store dir:objects",
+        example="rse-pf map live start warehouse --from warehouse",
         request=_StartRequest,
         run=_start,
     ),
     "stop": Action(
         help="publish a live map and close it",
-        example="rse-pf map live stop warehouse --store dir:objects",
+        example="rse-pf map live stop warehouse",
         request=MapRequest,
         run=_stop,
     ),
     "forget": Action(
         help="remove what a robot contributed",
-        example="rse-pf map live forget warehouse robot-1 --store dir:objects",
+        example="rse-pf map live forget warehouse robot-1",
         request=_ForgetRequest,
         run=_forget,
     ),

@@ -8,19 +8,19 @@ Each action has its own help page: rse-pf map merge --help.
 examples:
   rse-pf map from-camera 0 --intrinsics intrinsics.json --out out-camera
   rse-pf map from-bag kitchen.bag --out out-bag
-  rse-pf map list --store dir:objects
-  rse-pf map show kitchen --store dir:objects --png kitchen.png
-  rse-pf map merge robot-1 robot-2 robot-3 --into kitchen --store dir:objects
-  rse-pf map localise kitchen recordings/kitchen:0-40 --store dir:objects
+  rse-pf map list
+  rse-pf map show kitchen --png kitchen.png
+  rse-pf map merge robot-1 robot-2 robot-3 --into kitchen
+  rse-pf map localise kitchen recordings/kitchen:0-40
   rse-pf map localise kitchen photo.jpg --enrolment phone.enrolment --intrinsics intrinsics.json
-  rse-pf map view kitchen --out kitchen.png --store dir:objects
-  rse-pf map diff kitchen 3f9bd1 head --store dir:objects
-  rse-pf map live list --store dir:objects
+  rse-pf map view kitchen --out kitchen.png
+  rse-pf map diff kitchen 3f9bd1 head
+  rse-pf map live list
   rse-pf map backup acme.maps --tenant acme --name lab
   rse-pf map restore acme.maps --tenant acme --name lab
-  rse-pf map prune kitchen --keep 10 --store dir:objects
-  rse-pf map export kitchen --format ply --out kitchen.ply --store dir:objects
-  rse-pf map export kitchen --format occupancy --out kitchen-plan --store dir:objects
+  rse-pf map prune kitchen --keep 10
+  rse-pf map export kitchen --format ply --out kitchen.ply
+  rse-pf map export kitchen --format occupancy --out kitchen-plan
 """
 
 from __future__ import annotations
@@ -281,73 +281,73 @@ ACTION = Action(
     actions={
         "list": Action(
             help="list the maps",
-            example="rse-pf map list --store dir:objects",
+            example="rse-pf map list",
             request=StoreRequest,
             run=_list,
         ),
         "show": Action(
             help="show the contents and the origin of a version",
-            example="rse-pf map show kitchen --png kitchen.png --store dir:objects",
+            example="rse-pf map show kitchen --png kitchen.png",
             request=_ShowRequest,
             run=_show,
         ),
         "view": Action(
             help="draw a version as an image",
-            example="rse-pf map view kitchen --out kitchen.png --store dir:objects",
+            example="rse-pf map view kitchen --out kitchen.png",
             request=_ViewRequest,
             run=_view,
         ),
         "merge": Action(
             help="merge several maps into one, or close the loops of one map",
-            example="rse-pf map merge robot-1 robot-2 --into kitchen --store dir:objects",
+            example="rse-pf map merge robot-1 robot-2 --into kitchen",
             request=_MergeRequest,
             run=_merge,
         ),
         "localise": Action(
             help="estimate the camera poses of images in a map",
-            example="rse-pf map localise kitchen frame.png --store dir:objects",
+            example="rse-pf map localise kitchen frame.png",
             request=LocaliseRequest,
             run=run_localise,
         ),
         "diff": Action(
             help="show the differences between two versions",
-            example="rse-pf map diff kitchen 3f9bd1 head --store dir:objects",
+            example="rse-pf map diff kitchen 3f9bd1 head",
             request=_DiffRequest,
             run=_diff,
         ),
         "rollback": Action(
             help="set the head to an earlier version",
-            example="rse-pf map rollback kitchen 3f9bd1 --store dir:objects",
+            example="rse-pf map rollback kitchen 3f9bd1",
             request=_RollbackRequest,
             run=_rollback,
         ),
         "prune": Action(
             help="remove all but the newest versions",
-            example="rse-pf map prune kitchen --keep 10 --store dir:objects",
+            example="rse-pf map prune kitchen --keep 10",
             request=_PruneRequest,
             run=_prune,
         ),
         "export": Action(
             help="write a version in the format of another program",
-            example="rse-pf map export kitchen --format colmap --out kitchen-colmap --store dir:objects",
+            example="rse-pf map export kitchen --format colmap --out kitchen-colmap",
             request=ExportRequest,
             run=functools.partial(run_export, write_bag=export_bag),
         ),
         "backup": Action(
             help="write all maps of a tenant into one file",
-            example="rse-pf map backup acme.maps --tenant acme --store dir:objects",
+            example="rse-pf map backup acme.maps --tenant acme",
             request=BackupRequest,
             run=run_backup,
         ),
         "restore": Action(
             help="restore the maps of a tenant from a backup",
-            example="rse-pf map restore acme.maps --tenant acme --store dir:objects",
+            example="rse-pf map restore acme.maps --tenant acme",
             request=RestoreRequest,
             run=run_restore,
         ),
         "publish": Action(
             help="publish a live map as the next version of its map",
-            example="rse-pf map publish warehouse --store dir:objects",
+            example="rse-pf map publish warehouse",
             request=MapRequest,
             run=run_publish,
         ),

@@ -6,9 +6,9 @@ lose at most the parts that were being computed.  The result is that of rse-pf m
 aligned clouds (--no-icp leaves them out).  --scheduler uses the workers of a Dask scheduler that runs.
 
 examples:
-  rse-pf batch run merge robot-1 robot-2 robot-3 --out kitchen --store dir:objects
+  rse-pf batch run merge robot-1 robot-2 robot-3 --out kitchen
   rse-pf batch run merge robot-1 robot-2 --out kitchen --store s3:maps --scheduler tcp://10.0.1.7:8786
-  rse-pf batch clean --store dir:objects
+  rse-pf batch clean
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def delete_parts(request: CleanRequest, settings: PlatformSettings) -> None:
     show(f"{counted(len(names), 'object')} deleted")
 
 
-_EXAMPLE = "rse-pf batch run merge robot-1 robot-2 --out kitchen --store dir:objects"
+_EXAMPLE = "rse-pf batch run merge robot-1 robot-2 --out kitchen"
 ACTION = Action(
     actions={
         "run": Action(
@@ -168,7 +168,7 @@ ACTION = Action(
         "clean": Action(
             help="delete the parts of merges that were not finished",
             description="Delete the parts of merges that were not finished; a merge that still runs fails.",
-            example="rse-pf batch clean --store dir:objects",
+            example="rse-pf batch clean",
             request=CleanRequest,
             run=delete_parts,
         ),
