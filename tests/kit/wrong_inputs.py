@@ -47,6 +47,7 @@ def make_files(folder: Path) -> None:
         (folder / name).mkdir(exist_ok=True)
     state = folder / "state" / "rse-pf" / "default"
     state.mkdir(parents=True)
+    (state.parent / "a-folder-of-maps" / "objects").mkdir(parents=True)
     ensure_key(state, seed=b"s" * 32, key_id="k")
     maps = MapRegistry(DirectoryStore(folder / "store"))
     maps.commit("hall", _map(2), parent=None, author="a test", created_s=1.0)
