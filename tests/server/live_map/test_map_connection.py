@@ -22,52 +22,6 @@ from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
 from tests.kit.fake_map import keyframe_request
 from tests.kit.fakes import FakeLog
 
-
-class Worker:
-    """One worker with its connection to one map."""
-
-    def __init__(self) -> None:
-        self.store = MemoryStore()
-        self.started: list[FakeProcess] = []
-        self.updates: list[dict[str, Any]] = []
-        self.pool = MapServerPool(self._spawn, max_processes=2, keeps_spare=False)
-        context = ConnectionContext(
-            store=self.store,
-            settings=PlatformSettings().live,
-            server_id="here",
-            log=FakeLog(),
-            call=self._call,
-            key=lambda: b"k" * 32,
-            pool=self.pool,
-            clock=time.monotonic,
-            wall_clock=time.time,
-        )
-        self.map = MapConnection(
-            context, "default", "warehouse", on_update=self.updates.append, on_end=lambda connection: None
-        ).start()
-
-    def lease(self) -> LeaseRecord | None:
-        with contextlib.suppress(NotFound):
-            return decode_lease(LEASE, self.store.get(LEASE))
-        return None
-
-    async def __aenter__(self) -> Worker:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.map.close()
-        self.pool.kill_spare()
-        for child in self.pool.in_use:
-            child.kill()
-
-    def _spawn(self, at_low_priority: bool) -> FakeProcess:
-        self.started.append(FakeProcess(self.store))
-        return self.started[-1]
-
-    async def _call(self, act: Callable[[], Any]) -> Any:
-        return act()
-
-
 LEASE = lease_name("default", "warehouse")
 FIRST = KeyframeRequest(map="warehouse", segment=0, number=0, keyframe=b"")
 ROBOT = RobotId("default", "robot-1")
@@ -223,7 +177,7 @@ async def test_a_connection_that_is_closed_before_its_welcome_closes_its_socket(
 async def test_a_map_server_whose_port_was_never_reached_keeps_its_lease() -> None:
     """A firewall may refuse what the other servers can reach."""
 
-    async with Worker() as worker:
+    async with ConnectedWorker() as worker:
         owner_on_a_closed_port(worker)
         sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 0.3))
         await until(lambda: worker.started)
