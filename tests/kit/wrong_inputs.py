@@ -176,7 +176,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("local logs --since soon", USAGE, "--since 'soon' is neither an age nor a time", "write an age such as 90s, 5m, 2h or 1d"),
     WrongInput("local status --since 5m", USAGE, "unknown option --since", "--since is an option of logs, events"),
     WrongInput("local roll --settings range.json", USAGE, "scaling.busy_cpu_percent = 900.0 is above 100", "lower it in cdk.json"),
-    WrongInput("map list --name nowhere", USAGE, "there is no platform 'nowhere' on this machine", "known: default"),
+    WrongInput("map list --name nowhere", USAGE, "there is no platform 'nowhere' on this machine", "known: a-folder-of-maps, default"),
     WrongInput("local status --follow", USAGE, "unknown option --follow", "--follow is an option of logs, events"),
     WrongInput("local status --lan 10.1.2.3", USAGE, "unknown option --lan", "--lan is an option of start"),
     WrongInput("local --lan status", USAGE, "--lan status is not an address", "for example: --lan 192.168.1.20; ip"),
