@@ -128,12 +128,14 @@ def test_the_sharper_of_two_near_images_becomes_a_view() -> None:
 
 
 def test_without_the_extra_the_verb_names_it_before_any_work(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    video = tmp_path / "drive.mp4"
+    video.touch()
     found = extras.importlib.util.find_spec
     monkeypatch.setattr(
         extras.importlib.util, "find_spec", lambda name: None if name == "pycolmap" else found(name)
     )
 
-    assert main(["camera", "calibrate", "drive.mp4"]) == 2
+    assert main(["camera", "calibrate", str(video)]) == 2
     assert "  hint: pip install 'rse-pf[calibrate]'" in capsys.readouterr().err
