@@ -1,8 +1,9 @@
-"""Write the server's log: one JSON object a line, in a thread of its own.
+"""Write the log of a server process: one JSON object a line.
 
-Lines are collected in memory and written by a thread, so that a slow disk or a full pipe never stops the
-event loop; lines that do not fit are counted and dropped.  Payloads and tokens are never logged, and a
-hostile string cannot break a line.
+Log calls append lines to a queue in memory, and a thread writes them, so that a slow disk or a full pipe
+never stops the event loop.  Lines beyond `_MAX_HELD_LINES` in the queue are dropped and counted.  Control
+characters in strings are escaped, so that a string of a robot cannot break a line.  Callers never pass
+payloads or tokens.
 """
 
 from __future__ import annotations
@@ -20,24 +21,34 @@ from rse_pf.terminal import json_line
 
 __all__ = ["JsonLog"]
 
-_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
-_MAX_TEXT = 256
-_MAX_TRACEBACK = 8192
-_MAX_HELD_LINES = 20_000
-_CHUNK_BYTES = 4096
-"""A write up to this size does not mix with other writers of the same pipe."""
-_FLUSH_S = 0.2
+_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}  # severity: a greater number is more severe
+_MAX_TEXT = 256  # characters of a string field; the rest is cut off, since robots choose some of the strings
+_MAX_TRACEBACK = 8192  # characters of the field ``traceback``: its end is kept, which names the exception
+_MAX_HELD_LINES = 20_000  # lines that wait to be written; further ones are dropped, so that memory is bounded
+_CHUNK_BYTES = 4096  # bytes of one write: PIPE_BUF of Linux, up to which writes to a shared pipe do not mix
+_FLUSH_S = 0.2  # the writer collects lines for this many seconds, so that many lines cost one system call
 
 _encode = msgspec.json.Encoder().encode
 
 
 class JsonLog:
-    """The log of one process; its methods only append to a list."""
+    """The log of one process; logging appends a line to a queue and never blocks.
+
+    ``dropped`` counts the lines that were lost, because the queue was full or writing failed.
+    """
 
     def __init__(
         self, *, level: str, server: str, wall_clock: Callable[[], float], fd: int = 2, **about: str
     ) -> None:
-        """Write nothing yet; every line gets the fields *about* that it does not set itself."""
+        """Write nothing before `start`.
+
+        Args:
+            level: Lines below this level are left out: debug, info, warning or error.
+            server: Name of the server, a field of every line.
+            wall_clock: Returns Unix seconds, the field ``time`` of every line.
+            fd: The descriptor to which lines are written; 2 is standard error.
+            **about: Further fields of every line; a log call may set them to other values.
+        """
         self.dropped = 0
         self._about = {"server": server, **about}
         self._lowest = _LEVELS[level]
@@ -49,16 +60,16 @@ class JsonLog:
         self._writer = threading.Thread(target=self._write_on, name="log", daemon=True)
 
     def start(self) -> JsonLog:
-        """Begin to write lines, also those that were logged before this call; return this object."""
+        """Start the writer thread, which also writes lines logged before this call; return this log."""
         self._writer.start()
         return self
 
     def writes(self, level: str) -> bool:
-        """Whether lines of *level* are written at all."""
+        """Return whether lines of *level* are written, or left out by the level of this log."""
         return _LEVELS[level] >= self._lowest
 
     def debug(self, event: str, **fields: Any) -> None:
-        """Log an event that only developers need."""
+        """Log an event that only developers need, such as each answered command."""
         self._line("debug", event, fields)
 
     def info(self, event: str, **fields: Any) -> None:
@@ -70,11 +81,11 @@ class JsonLog:
         self._line("warning", event, fields)
 
     def error(self, event: str, **fields: Any) -> None:
-        """Log a defect."""
+        """Log a defect of the platform or of a service."""
         self._line("error", event, fields)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write the remaining lines, for at most *timeout_s* seconds."""
+        """Write the remaining lines and stop the writer thread; wait for it at most *timeout_s* seconds."""
         self._over = True
         self._wake.set()
         self._writer.join(timeout_s)
@@ -112,6 +123,7 @@ class JsonLog:
 
 
 def _chunks(lines: list[bytes]) -> list[bytes]:
+    """Return *lines* joined into chunks of at most `_CHUNK_BYTES`; a longer line is a chunk of its own."""
     chunks: list[bytes] = []
     current: list[bytes] = []
     size = 0

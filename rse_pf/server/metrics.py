@@ -1,7 +1,7 @@
 """Count the work of each worker, add the counts of all workers, and render the sums for Prometheus.
 
-A worker only adds to plain numbers.  The supervisor requests a `snapshot` of each, merges and renders them.
-No label contains the name of a robot.
+A worker only adds to numbers in memory.  The supervisor requests a `Metrics.snapshot` of each worker, adds
+the snapshots (`merge`), and renders the sum as text (`render`).  No label contains the name of a robot.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Upper bounds of the duration histogram; the last bucket is open."""
+"""Upper bounds of the buckets of the duration histogram, in seconds; one more bucket has no upper bound."""
 
 GAUGE_HELP = {
     "robots": "robots that are connected to the server now, without synthetic ones such as the canary",
@@ -59,15 +59,20 @@ GAUGE_HELP = {
     "disk_free_percent": "free share of the disk of the server's working folder, in percent",
     "control_refused": "requests to the control port that were refused for lack of its token",
 }
-"""What each gauge means; a new gauge needs a line here."""
-MAX_TENANTS = 100  # tenants that a worker counts by name, so that the number of labels is bounded
-OTHER_TENANTS = "(others)"  # label of all further tenants together
-_GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")  # merged by maximum; others are added
-_RECENT_S = 1.0  # length of the two intervals of `LongestRecently`
+"""The help text of each gauge in the output of /metrics; a new gauge needs a line here."""
+MAX_TENANTS = 100  # tenants whose CPU seconds a worker counts by name: the number of labels is bounded
+OTHER_TENANTS = "(others)"  # label of the CPU seconds of all further tenants together
+# For these gauges `merge` takes the greatest value of all workers; it adds the values of all other gauges.
+_GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")
+_RECENT_S = 1.0  # seconds of each of the two intervals of `LongestRecently`
 
 
 class Metrics:
-    """The numbers of one worker."""
+    """The counters and gauges of one worker, from its start.
+
+    ``requests`` counts answers by service and result, ``shed`` refused commands by reason, ``handshakes`` by
+    result, ``closed`` connections by reason; ``durations`` has the histogram of each service.
+    """
 
     def __init__(self) -> None:
         self.requests: Counter[tuple[str, str]] = Counter()
@@ -80,19 +85,22 @@ class Metrics:
         self.bytes_out = 0
         self.gauges: dict[str, float] = {}
         self.tenant_cpu_s: dict[str, dict[str, float]] = {"commands": {}}
-        """CPU seconds by kind of work and by tenant."""
+        """CPU seconds by kind of work (commands, sandboxes, jobs, live-maps), then by tenant."""
         self._commands_s = self.tenant_cpu_s["commands"]
         self._tenants: set[str] = set()
 
     def set_cpu(self, kind: str, seconds: Mapping[str, float]) -> None:
-        """Replace the CPU *seconds* of a kind of work by those of its processes so far, by tenant."""
+        """Set the CPU seconds of the kind of work *kind* to *seconds*, the totals so far by tenant.
+
+        The tenants beyond `MAX_TENANTS` are added up under `OTHER_TENANTS`.
+        """
         taken: defaultdict[str, float] = defaultdict(float)
         for tenant, taken_s in seconds.items():
             taken[self._label(tenant)] += taken_s
         self.tenant_cpu_s[kind] = taken
 
     def _label(self, tenant: str) -> str:
-        """Return the label under which *tenant* is counted from now on."""
+        """Return the label of *tenant*: its name, or `OTHER_TENANTS` if `MAX_TENANTS` others have labels."""
         if tenant not in self._tenants and len(self._tenants) >= MAX_TENANTS:
             return OTHER_TENANTS
         self._tenants.add(tenant)
@@ -101,14 +109,14 @@ class Metrics:
     def count_answer(
         self, service: str, result: str, duration_s: float, tenant: str = "", computed_s: float = 0.0
     ) -> None:
-        """Count a final answer.
+        """Count the final answer to one command, and its duration.
 
         Args:
             service: Name of the service.
-            result: ``ok`` or the code of a failure.
+            result: ``ok``, or the code of the failure.
             duration_s: Seconds from the arrival of the command to its answer.
             tenant: The tenant of the robot.
-            computed_s: CPU seconds, added to those of *tenant*.
+            computed_s: Seconds of computation, added to the CPU seconds of *tenant*; 0 adds nothing.
         """
         if computed_s:
             try:
@@ -124,7 +132,7 @@ class Metrics:
         self.duration_sum_s[service] += duration_s  # type: ignore[assignment]
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all numbers as plain JSON values."""
+        """Return all counters and gauges as JSON values, for the report to the supervisor."""
         return {
             "requests": [[service, result, n] for (service, result), n in self.requests.items()],
             "shed": dict(self.shed),
@@ -143,7 +151,10 @@ class Metrics:
 
 
 class LongestRecently:
-    """The longest duration of the last one to two seconds, in constant memory."""
+    """The longest duration within the last one to two seconds, in constant memory.
+
+    The maximum is kept for the present second of the clock and for the second before it.
+    """
 
     def __init__(self) -> None:
         self._second = -1
@@ -152,16 +163,17 @@ class LongestRecently:
     def note(self, duration_s: float, now: float) -> None:
         """Add a duration that ended at *now* (monotonic seconds)."""
         if int(now // _RECENT_S) != self._second:
-            self._turn(now)
+            self._advance_to(now)
         if duration_s > self._longest_s[1]:
             self._longest_s[1] = duration_s
 
     def longest_s(self, now: float) -> float:
-        """Return the longest duration, 0 if there was none recently."""
-        self._turn(now)
+        """Return the longest duration, in seconds, of this second and the one before; 0 if there was none."""
+        self._advance_to(now)
         return max(self._longest_s)
 
-    def _turn(self, now: float) -> None:
+    def _advance_to(self, now: float) -> None:
+        """Make the second of *now* the present one; forget the maxima of seconds before the previous one."""
         second = int(now // _RECENT_S)
         if second != self._second:
             self._longest_s = [self._longest_s[1] if second == self._second + 1 else 0.0, 0.0]
@@ -169,7 +181,10 @@ class LongestRecently:
 
 
 def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the sum of the workers' snapshots; waits and lags are the greatest of all workers."""
+    """Return one snapshot of the server: the sum of the *snapshots* of its workers.
+
+    The gauges `_GAUGES_OF_WORST` (queue waits and event loop lag) are the greatest of all workers instead.
+    """
     requests: Counter[tuple[str, str]] = Counter()
     sums: dict[str, Counter[str]] = {
         name: Counter() for name in ("shed", "handshakes", "closed", "duration_sum_s", "bytes", "gauges")
@@ -200,7 +215,7 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def tenant_cpu_s(merged: Mapping[str, Any]) -> dict[str, float]:
-    """Return the CPU seconds of each tenant for all kinds of work, the largest first."""
+    """Return the CPU seconds of each tenant, summed over all kinds of work; the largest sum comes first."""
     taken: defaultdict[str, float] = defaultdict(float)
     for tenant, _, taken_s in merged["tenant_cpu_s"]:
         taken[tenant] += taken_s
@@ -208,7 +223,11 @@ def tenant_cpu_s(merged: Mapping[str, Any]) -> dict[str, float]:
 
 
 def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
-    """Return the sum of the workers' reports on sandboxes; zero without installed services."""
+    """Return one report on sandboxes from those of all workers; zeros and empty lists if none has any.
+
+    Numbers are added.  Missing means of isolation and open circuit breakers are those of any worker;
+    ``services`` are the services that every worker runs.
+    """
     reports = [snapshot["isolation"] for snapshot in snapshots if snapshot and "isolation" in snapshot]
     counts: Counter[str] = Counter()
     for report in reports:
@@ -225,7 +244,11 @@ def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, 
 
 
 def render(merged: Mapping[str, Any]) -> bytes:
-    """Return *merged* in the text format of Prometheus; raises MissingExtra."""
+    """Return *merged*, the result of `merge`, in the text format of Prometheus.
+
+    Raises:
+        MissingExtra: The package prometheus-client is not installed.
+    """
     try:
         from prometheus_client import CollectorRegistry, generate_latest
         from prometheus_client.core import (
@@ -297,5 +320,6 @@ def render(merged: Mapping[str, Any]) -> bytes:
 
 
 def _cumulate(buckets: list[int]) -> list[tuple[str, float]]:
+    """Return the upper bound and the cumulative count of each bucket, as Prometheus requires."""
     bounds = [*map(str, BUCKETS_S), "+Inf"]
     return list(zip(bounds, map(float, accumulate(buckets)), strict=True))

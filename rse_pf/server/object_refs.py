@@ -28,23 +28,26 @@ from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = ["ObjectRefs", "named_in", "resolve", "takes_objects"]
 
-_KEY = "object"
-_DIGEST = re.compile(r"[0-9a-f]{64}")
-MAX_OBJECTS_PER_COMMAND = 64  # stored objects in one command: each costs a request to the store
-MAX_OBJECT_BYTES_PER_COMMAND = 128 << 20  # all objects of one command: its process holds them in memory
-_MAX_DEPTH = 8  # levels of a request type in which references are looked for; recursive types end there
+_KEY = "object"  # the only key of the dict that is a reference
+_DIGEST = re.compile(r"[0-9a-f]{64}")  # a sha256 in hexadecimal digits
+MAX_OBJECTS_PER_COMMAND = 64  # different stored objects in one command: each costs two requests to the store
+# Bytes of all stored objects of one command, and of a stored reply: a process holds them in memory.
+MAX_OBJECT_BYTES_PER_COMMAND = 128 << 20
+_MAX_DEPTH = 8  # nesting levels of a request type that are searched for ``bytes``: a type may contain itself
 
 
 def takes_objects(request_type: type[Any]) -> bool:
-    """Return whether *request_type* declares ``bytes`` anywhere, so that a reference may stand there."""
+    """Return whether *request_type* declares ``bytes`` in any field, where a robot may send a reference."""
     return _shape(request_type) is not None
 
 
 def named_in(request_type: type[Any], payload: Any) -> list[str]:
-    """Return the digests that *payload* refers to where *request_type* declares ``bytes``, in order.
+    """Return the digest of each reference in *payload*, in order; a digest may occur several times.
+
+    Only dicts in the places where *request_type* declares ``bytes`` are references.
 
     Raises:
-        BadRequest: A reference there is no sha256 in hex.
+        BadRequest: A reference is not a dict of one key with a sha256 in hexadecimal digits.
     """
     return [_digest(reference) for reference in _references(_shape(request_type), payload)]
 
@@ -55,21 +58,21 @@ def resolve(
     robot: RobotId,
     store: ObjectStore,
 ) -> Any:
-    """Return *payload* with the robot's own objects in the place of the references; blocks on the store.
+    """Return *payload* with each reference replaced by the bytes of the robot's object; blocks on the store.
 
-    A payload without references is returned as it is, and the store is not asked.
+    A payload without references is returned unchanged, without a request to the store.
 
     Args:
-        request_type: What the service takes, a msgspec Struct.
-        payload: As decoded from the wire: plain dicts and lists; not changed.
-        robot: The robot that the token names.
-        store: The store of the platform.
+        request_type: The request type of the service, a msgspec Struct.
+        payload: The payload of the command, decoded to plain dicts and lists; not changed.
+        robot: The robot that the token names; only its own objects are read.
+        store: The object store of the platform.
 
     Raises:
-        BadRequest: A reference is no sha256 in hex.
-        NotFound: The robot has no such object; another one may have.
-        LimitExceeded: More objects, or bytes in them, than one command may refer to.
-        StoreError: The store fails, or holds other bytes than the digest says.
+        BadRequest: A reference is not a dict of one key with a sha256 in hexadecimal digits.
+        NotFound: The robot has no object of that digest, even if another robot has.
+        LimitExceeded: More than `MAX_OBJECTS_PER_COMMAND` objects, or `MAX_OBJECT_BYTES_PER_COMMAND` in them.
+        StoreError: The store fails, or the stored bytes do not match the digest.
     """
     digests = list(dict.fromkeys(named_in(request_type, payload)))
     if not digests:
@@ -91,34 +94,39 @@ def resolve(
 
 @dataclass(frozen=True, slots=True)
 class ObjectRefs:
-    """The store and limits of one worker; without a store, references are not resolved."""
+    """Resolves references to stored objects, and stores large replies, for one worker.
+
+    Without a store a payload with references is passed on unchanged, and a large reply is a failure.
+    """
 
     store: ObjectStore | None
     data: DataSettings = field(default_factory=DataSettings)
-    """Quotas of tenants, and of robots whose tokens name none."""
+    """The quotas of tenants, and of robots without a quota of their own."""
 
     def has_references(self, command: Command, service: Service) -> bool:
-        """Return whether *command* refers to stored objects; cheap for services that take no ``bytes``.
+        """Return whether the payload of *command* has a reference; always False without a store.
 
-        Without a store, no reference is looked for.
+        For a service whose request type has no ``bytes`` the payload is not searched.
         """
         shape = None if self.store is None else _shape(service.request_type)
         return shape is not None and any(True for _ in _references(shape, command.payload))
 
     def resolve_references(self, command: Command, registry: Registry, robot: RobotId) -> Command:
-        """Return *command* with the bytes that its payload refers to; blocks on the store.
+        """Return *command* with each reference in its payload replaced by bytes; blocks on the store.
+
+        Without a store, or without a reference, *command* itself is returned.
 
         Args:
-            command: As decoded from the wire; not changed.
-            registry: Knows the request type of the service.
-            robot: Whose own objects alone are read.
+            command: The decoded command; not changed.
+            registry: Has the request type of the service.
+            robot: The robot that sent the command; only its own objects are read.
 
         Raises:
-            UnknownService: The registry does not know the service.
-            BadRequest: A reference is no sha256 in hex.
-            NotFound: The robot has no such object.
-            LimitExceeded: The command refers to more objects, or bytes in them, than it may.
-            StoreError: The store fails, or holds other bytes than the digest says.
+            UnknownService: The registry has no service of that name.
+            BadRequest: A reference is not a dict of one key with a sha256 in hexadecimal digits.
+            NotFound: The robot has no object of that digest.
+            LimitExceeded: The command refers to too many objects, or to too many bytes, see `resolve`.
+            StoreError: The store fails, or the stored bytes do not match the digest.
         """
         service = registry.get(command.service)
         if self.store is None or not self.has_references(command, service):
@@ -129,18 +137,19 @@ class ObjectRefs:
     def store_large_reply(
         self, result: Result, too_large: Failure, robot: RobotId, claims: Claims | None
     ) -> Result | Failure:
-        """Store the reply of *result*, which is too large for a message; blocks on the store.
+        """Store a reply that is too large for a message as an object of the robot; blocks on the store.
 
         Args:
-            result: Of the service.
-            too_large: The failure that the robot gets if the reply cannot be stored.
-            robot: Whose quota the stored reply counts for.
-            claims: Of its token, which may name the quota.
+            result: The result of the service, with the reply.
+            too_large: The failure that is returned if the reply cannot be stored.
+            robot: The robot; the stored reply counts for its quota.
+            claims: The claims of the robot's token, which may hold the quota ``data_bytes``; None: no token.
 
         Returns:
-            *result* with the digest of the stored reply instead of the reply; *too_large* if there is no
-            store, if it fails, or if the reply is too large for it as well; the failure of the quota if the
-            reply is beyond that of the robot or of its tenant.
+            *result* without the reply and with the digest of the stored object.  *too_large* if there is no
+            store, if the store fails, or if the reply has more than `MAX_OBJECT_BYTES_PER_COMMAND`.
+            *too_large* with code, message and hint of QuotaExceeded if the reply exceeds the quota of the
+            robot or of its tenant.
         """
         if self.store is None:
             return too_large
@@ -158,24 +167,24 @@ class ObjectRefs:
         return msgspec.structs.replace(result, reply=None, object=digest)
 
 
-# --- where references may stand -----------------------------------------------------------------------
+# --- The shape of a request type: the places where it declares bytes, so that references may stand there ---
 
 
 @dataclass(frozen=True, slots=True)
 class _Bytes:
-    """A reference may stand here."""
+    """Shape of a place where the request type declares ``bytes``: a reference may stand there."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Each:
-    """References may stand in each item of a list, or in each value of a dict."""
+    """Shape of a list or a dict: each item, or each value, has the shape *below*."""
 
     below: Any
 
 
 @dataclass(frozen=True, slots=True)
 class _Fields:
-    """References may stand in these fields of a struct."""
+    """Shape of a struct: *below* has the shapes of those fields that contain ``bytes``, by field name."""
 
     below: dict[str, Any]
 
@@ -190,7 +199,10 @@ def _cached_shape(request_type: type[Any]) -> Any:
 
 
 def _shape_of(kind: Any, depth: int) -> Any:
-    """Return the places below *kind* where bytes are declared, None if there are none."""
+    """Return the shape of the msgspec type *kind*, None if it contains no ``bytes`` within *depth* levels.
+
+    A union has the shape of its only member with ``bytes``; with several such members it has None.
+    """
     known = msgspec.inspect
     if depth == 0:
         return None
@@ -213,7 +225,7 @@ def _shape_of(kind: Any, depth: int) -> Any:
 
 
 def _references(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
-    """Yield each dict in *value* that has the form of a reference and stands where *shape* has bytes."""
+    """Yield each dict with the key ``object`` that *value* has in a place where *shape* has ``bytes``."""
     if isinstance(shape, _Bytes):
         if isinstance(value, dict) and _KEY in value:
             yield value
@@ -227,7 +239,10 @@ def _references(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
 
 
 def _replace(shape: Any, value: Any, read: Callable[[Any], Any]) -> Any:
-    """Return *value* with `read(digest)` in the place of each reference; unchanged parts are shared."""
+    """Return a copy of *value* with `read(digest)` in place of each reference.
+
+    Parts in which the request type has no ``bytes`` are not copied.
+    """
     if isinstance(shape, _Bytes):
         return read(_digest(value)) if isinstance(value, dict) and _KEY in value else value
     if isinstance(shape, _Each) and isinstance(value, dict):
@@ -246,8 +261,8 @@ def _digest(value: dict[str, Any]) -> str:
     digest = value[_KEY]
     if len(value) != 1 or not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         raise BadRequest(
-            "this is no reference to an object",
-            hint='write {"object": "..."} with the sha256, 64 small hex digits',
+            "the payload has an invalid reference to a stored object",
+            hint='write {"object": "..."} with the sha256 of the object, 64 lower-case hexadecimal digits',
         )
     return digest
 
@@ -265,7 +280,9 @@ def _read(store: ObjectStore, name: str, digest: str) -> bytes:
     except NotFound:
         raise _missing(digest) from None
     if digest_of(data) != digest:
-        raise StoreError("the bytes are not those of the digest", hint="store the object again")
+        raise StoreError(
+            "the stored bytes do not match the digest of the object", hint="store the object again"
+        )
     return data
 
 

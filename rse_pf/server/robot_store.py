@@ -1,7 +1,7 @@
 """Store objects for robots in a backend server, within the quotas of robot and tenant.
 
-The quota of a robot is its own one in the roster, or else ``data.quota_bytes``, as in the data service.  No
-object is removed to make room for another.
+The quota of a robot is the one in its token or the roster, or else ``data.quota_bytes``, as in the data
+service.  An object that does not fit is refused; no other object is removed for it.
 """
 
 from __future__ import annotations
@@ -14,23 +14,30 @@ from rse_pf.storage.quotas import Accounts
 
 __all__ = ["is_shared", "store_within_quota"]
 
-_PRIVATE_STORE = "memory:"
+_PRIVATE_STORE = "memory:"  # value of ``data.store`` with which each process has a store in its own memory
 
 
 def is_shared(settings: PlatformSettings) -> bool:
-    """Return whether other processes see what one process stores."""
+    """Return whether all processes use the same store: not if ``data.store`` is in a process's own memory."""
     return settings.data.store != _PRIVATE_STORE
 
 
 def store_within_quota(
     store: ObjectStore, accounts: Accounts, robot: RobotId, data: bytes, max_bytes: float | None
 ) -> str:
-    """Store *data* durably as an object of the robot, and return its digest.
+    """Store *data* durably as an object of the robot, and return its digest (sha256 in hexadecimal digits).
 
-    An object that is stored already is not counted again.
+    If the robot has this object already, nothing is written or counted.
+
+    Args:
+        store: The object store of the platform.
+        accounts: The accounts of robots and tenants, which count *data*.
+        robot: The robot.
+        data: The bytes of the object.
+        max_bytes: The quota of the robot in bytes; None means ``data.quota_bytes``.
 
     Raises:
-        QuotaExceeded: It does not fit into the quota of the robot or of its tenant.
+        QuotaExceeded: *data* does not fit into the quota of the robot or of its tenant.
         StoreError: The store fails, or is full.
     """
     digest = digest_of(data)

@@ -1,4 +1,8 @@
-"""Declare what the parts of a worker share: clocks, log, settings, and interfaces of socket and recorder."""
+"""Declare what the parts of a worker process share: clocks, log, settings, metrics, and five interfaces.
+
+The interfaces are `Wire` (a robot's socket), `CrashMarks` (for crash reports), `MessageTap` and
+`ServerRecorder` (for recordings), and `Subscriber` (for live maps).
+"""
 
 from __future__ import annotations
 
@@ -27,57 +31,63 @@ class Wire(Protocol):
     """The socket of one robot; only `rse_pf.server.gateway.websocket`, which makes it, imports picows."""
 
     def send(self, data: bytes, is_text: bool) -> None:
-        """Write one message; does nothing on a socket that ended."""
+        """Write one WebSocket message, as text or binary; do nothing if the socket is closed."""
 
     def unsent_bytes(self) -> int:
-        """Return how many bytes wait in this process, because the kernel does not take more."""
+        """Return the bytes in this process's write buffer: written here, and not yet taken by the kernel."""
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Limit the bytes of this connection that the kernel holds and has not sent to *max_bytes*."""
+        """Let the kernel accept bytes of this connection only while fewer than *max_bytes* are unsent there.
+
+        The rest stays in the write buffer of this process, where `unsent_bytes` counts it.
+        """
 
     def send_pong(self, data: bytes) -> None:
-        """Write one pong frame."""
+        """Write one pong frame with the payload *data*."""
 
     def pause(self, seconds: float) -> None:
-        """Read nothing more for *seconds*."""
+        """Read nothing from the socket for *seconds*; of two pauses the one that lasts longer counts."""
 
     def hold(self) -> None:
-        """Read nothing more until `read_on` was called as often as this."""
+        """Read nothing from the socket until `read_on` was called once for each call of `hold`."""
 
     def read_on(self) -> None:
-        """End one `hold`."""
+        """End one `hold`; reading continues when no hold and no pause is left."""
 
     def close(self, code: int, reason: str) -> None:
-        """Write a close frame and end the connection."""
+        """Write a close frame with *code* and *reason*, then close the connection."""
 
 
 class CrashMarks(Protocol):
-    """Notes of a worker for which robot it computes; `rse_pf.server.supervisor.crash_report` has them."""
+    """Marks for which connection each thread of a worker works, so that a crash can be charged to a robot.
+
+    `rse_pf.server.supervisor.crash_report.CrashReport` implements this interface.
+    """
 
     of_loop: memoryview
-    """The connection for which the thread of the event loop works, in its only element; 0 for none."""
+    """One element: the number of the connection for which the event loop's thread works; 0 for none."""
 
     def enter(self, number: int, robot: RobotId) -> None:
-        """Note the robot of the new connection *number*."""
+        """Note that the new connection *number* is one of *robot*."""
 
     def compute_for(self, number: int) -> int:
-        """Note that this thread works for the connection *number* from now on; return the one before.
+        """Mark that the calling thread works for the connection *number* from now on; 0 for none.
 
-        0 stands for none.
+        Return the number that was marked before, so that the caller can restore it.
         """
 
 
 class NoCrashMarks:
-    """Notes of nothing, for a process that is not replaced after a crash."""
+    """Ignore all marks, for a process that is not replaced after a crash."""
 
     def __init__(self) -> None:
         self.of_loop = memoryview(bytearray(8)).cast("Q")
 
     def enter(self, number: int, robot: RobotId) -> None:
-        """Note nothing."""
+        """Ignore the connection."""
 
     def compute_for(self, number: int) -> int:
-        """Note nothing."""
+        """Ignore the mark and return 0, which stands for no connection."""
         return 0
 
 
@@ -89,7 +99,7 @@ class MessageTap(Protocol):
     """
 
     dropped: int
-    """Messages that could not be recorded."""
+    """Number of messages that were not recorded, because the recorder was too slow or has ended."""
 
     def open_connection(self, codec: str, robot: RobotId) -> int:
         """Return a number that identifies a new connection in later calls; *codec* is the codec's name."""
@@ -98,23 +108,23 @@ class MessageTap(Protocol):
         """Observe the bytes of a message from the robot, before they are decoded."""
 
     def observe_command(self, data: bytes, command: Command) -> None:
-        """Observe the command that *data*, the message that was received last, was decoded to."""
+        """Observe that *data*, the bytes of the message observed last, was decoded to *command*."""
 
     def observe_sent(self, connection: int, data: bytes) -> None:
         """Observe the bytes of a message to the robot."""
 
     def observe_answer(self, data: bytes, command: Command, answer: Result | Failure) -> None:
-        """Observe which *answer* to which command *data*, the message that was sent last, holds."""
+        """Observe that *data*, the bytes of a message to the robot, is *answer* to *command*."""
 
     def close_connection(self, connection: int) -> None:
-        """Observe that *connection* has ended."""
+        """Observe that the connection with the number *connection* was closed."""
 
     def flush(self) -> None:
-        """Pass on what was observed; the worker exits."""
+        """Pass all observed messages to the recorder, before the worker exits."""
 
 
 class NullMessageTap:
-    """Ignore all messages: the tap of a server that records nothing."""
+    """The tap of a server that records nothing: it ignores all messages, and its ``dropped`` stays 0."""
 
     def __init__(self) -> None:
         self.dropped = 0
@@ -143,27 +153,33 @@ class NullMessageTap:
 
 
 class ServerRecorder(Protocol):
-    """Record the messages of one server; the supervisor enters it before it forks the workers."""
+    """Record the messages of one server.
+
+    The supervisor enters it as a context before the workers are forked, and leaves it after they exited.
+    """
 
     pids: list[int]
-    """The processes of the recorder."""
+    """Ids of the recorder's processes, whose CPU time and memory count for the server."""
 
     def __enter__(self) -> object:
-        """Start to record."""
+        """Start the recording."""
 
     def __exit__(self, *_: object) -> None:
         """Finish the recording; all workers have exited."""
 
     def open_tap(self, call_later: Callable[[float, Callable[[], None]], object], log: Log) -> MessageTap:
-        """Return the tap of a worker, which calls this after it was forked.
+        """Return the tap of a worker; called once in each worker process.
 
         Args:
-            call_later: Of the event loop of the worker.
+            call_later: Method of the worker's event loop.
             log: The log of the worker.
         """
 
     def leave_to_workers(self) -> None:
-        """Note that all workers are forked, so that only they keep the recording open."""
+        """Close the supervisor's copy of the socket to the recorder, after all workers were forked.
+
+        The recorder then notices when the last worker has exited.  Nothing may be forked afterwards.
+        """
 
 
 class NullServerRecorder:
@@ -187,9 +203,9 @@ class NullServerRecorder:
 
 
 class Subscriber(Protocol):
-    """The connection of a robot that has subscriptions, as live maps use it.
+    """The connection of a robot that subscribes to updates of live maps.
 
-    Messages are written only as fast as the robot reads them.
+    Live maps read ``unsent_bytes`` before they write, so that a slow robot gets only the newest updates.
     """
 
     is_connected: bool
@@ -199,34 +215,41 @@ class Subscriber(Protocol):
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that were written and that the kernel has not taken."""
+        """Bytes in this process's write buffer: written here, and not yet taken by the kernel."""
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Limit the bytes of this connection that the kernel holds and has not sent to *max_bytes*."""
+        """Let the kernel accept bytes of this connection only while fewer than *max_bytes* are unsent there.
+
+        The rest stays in the write buffer of this process, where ``unsent_bytes`` counts it.
+        """
 
     def write(self, data: bytes) -> None:
-        """Write one message."""
+        """Write one encoded message, unless the connection is closing."""
 
     def refuse_updates(self, identity: int, error: RsePfError) -> None:
-        """Write that the subscription *identity* ends because of *error*."""
+        """Send the robot a failure that ends the subscription with the id *identity* because of *error*."""
 
 
 class Log(Protocol):
-    """Log of events, such as `rse_pf.server.log.JsonLog`."""
+    """A log of events with a level and fields, such as `rse_pf.server.log.JsonLog`."""
 
     def info(self, event: str, **fields: Any) -> None:
-        """Write an event of normal operation."""
+        """Log an event of normal operation."""
 
     def warning(self, event: str, **fields: Any) -> None:
-        """Write an event that an operator should look at."""
+        """Log an event that an operator should look at."""
 
     def error(self, event: str, **fields: Any) -> None:
-        """Write a defect."""
+        """Log a defect of the platform or of a service."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clocks:
-    """The clocks of a worker, in seconds: monotonic time, Unix time, and CPU time of the process."""
+    """The clocks of a worker; each returns seconds.
+
+    ``monotonic`` is for durations and deadlines, ``wall`` is Unix time, and ``cpu`` is the CPU time that the
+    worker process has used.
+    """
 
     monotonic: Callable[[], float]
     wall: Callable[[], float]
@@ -234,7 +257,7 @@ class Clocks:
 
 
 def make_session_id() -> str:
-    """Return a random id of a session, 16 hexadecimal digits."""
+    """Return a random id for the session of a connection: 16 hexadecimal digits."""
     return secrets.token_hex(8)
 
 
@@ -244,14 +267,14 @@ class WorkerContext:
 
     Attributes:
         settings: The settings of the platform.
-        server_id: The name of the server in welcomes and answers.
+        server_id: The name of the server, as robots get it in the Welcome and in answers.
         clocks: The clocks of the worker.
         loop: The event loop of the worker.
         log: The log of the worker.
         metrics: The counters of the worker.
         tap: Observes the messages of all connections, for a recording.
-        crash: Notes for which robot this process computes, in case it crashes.
-        new_session_id: Makes the id of a session, which goes into its welcome.
+        crash: Marks for which robot each thread computes, for the report of a crash in native code.
+        new_session_id: Returns a new id for the session of a connection, which is sent in its Welcome.
     """
 
     settings: PlatformSettings
