@@ -1,5 +1,6 @@
-"""Limited services: commands that are computed in processes with limits on memory and CPU time.
+"""Limited services: services that a worker runs in processes with limits on memory and CPU time.
 
-Their processes, and the robots that are refused after crashes, belong here.  How a process is limited and
-killed belongs to `rse_pf.processes.limited`; their queue to `rse_pf.server.gateway.service_queues`.
+A service is limited if it decodes data that may expand to any size, such as a map.  This package has the
+code of these processes, and refuses robots whose commands crashed them.  `rse_pf.processes.limited` sets the
+limits and kills a process; `rse_pf.server.gateway.service_queues.LimitedQueue` has the commands that wait.
 """

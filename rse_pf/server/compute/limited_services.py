@@ -1,7 +1,7 @@
 """Compute a command of a limited service in a process that is killed at the deadline of the command.
 
-A command that exceeds a limit fails, and its failure names the limit.  A robot whose commands ended two
-processes is refused these services for a while (`CrashRecord`).
+A command that exceeds a limit of memory, CPU time or time gets a failure that names the limit.  A robot whose
+commands crashed two processes within five minutes may not use limited services for a minute (`CrashRecord`).
 """
 
 from __future__ import annotations
@@ -21,13 +21,16 @@ from rse_pf.wire import Command, Failure, Result
 
 __all__ = ["LimitedServices", "limited_processes"]
 
-# A command that used this much CPU time and was not computed by its deadline counts as a crash.  Otherwise
-# its robot could occupy the processes all the time.  A command with a shorter deadline does not count.
+# CPU seconds: a command that has used this much when it is killed at its deadline counts as a crash of its
+# robot, which could otherwise occupy the process all the time.  One with a shorter deadline cannot reach it.
 _LONG_WORK_S = 2.0
 
 
 def limited_processes(services: str, settings: PlatformSettings) -> LimitedProcesses:
-    """Return the processes of one worker, none of which is started; *services* is ``module:function``."""
+    """Return the limited processes of one worker, with the limits of *settings*; none is started yet.
+
+    *services* is the ``module:function`` that returns the registry of services.
+    """
     serving = settings.serving
     return LimitedProcesses(
         TARGET,
@@ -41,7 +44,7 @@ def limited_processes(services: str, settings: PlatformSettings) -> LimitedProce
 
 
 class LimitedServices:
-    """The limited services of one worker."""
+    """Computes commands of limited services for one worker, and refuses robots after crashes."""
 
     def __init__(self, context: WorkerContext, processes: LimitedProcesses) -> None:
         self._context = context
@@ -49,11 +52,14 @@ class LimitedServices:
         self._crashes = CrashRecord()
 
     def refusal(self, queued: QueuedCommand, now: float) -> Busy | None:
-        """Return why the robot of *queued* may not use these services now, None if it may."""
+        """Return the error for *queued* if crashes block its robot at *now* (monotonic s), None otherwise."""
         return self._crashes.refusal(queued.robot, now)
 
     def compute(self, queued: QueuedCommand) -> Result | Failure:
-        """Answer *queued*; blocks until its deadline at most, and may run in several threads."""
+        """Return the answer to *queued*; any error becomes a Failure.
+
+        Blocks until the deadline of *queued* at most; several threads may call this method.
+        """
         try:
             return self._compute(queued)
         except RsePfError as error:
@@ -64,15 +70,18 @@ class LimitedServices:
         return failure_of(failure, queued.command, server=self._context.server_id)
 
     def blocked_robots(self, now: float) -> int:
-        """Return how many robots are refused at *now* (monotonic seconds)."""
+        """Return how many robots are blocked at *now* (monotonic seconds) after crashes."""
         return len(self._crashes.blocked(now))
 
     def cpu_s(self) -> float:
-        """Return the CPU seconds of all processes so far; less again after the fork server has restarted."""
+        """Return the CPU seconds of the limited processes so far.
+
+        The number starts again from 0 when the process that forks them was restarted.
+        """
         return sum(map(cpu_seconds, self._processes.pids()))
 
     def close(self) -> None:
-        """End all processes; commands that are computed now are answered with WorkerLost."""
+        """Kill all limited processes; commands that run in them get the failure WorkerLost."""
         self._processes.close()
 
     def _compute(self, queued: QueuedCommand) -> Result | Failure:

@@ -1,7 +1,7 @@
-"""Code of a process for limited services: read the objects of one command, call the service, encode the
-reply.
+"""The code that runs in a limited process: read stored objects, call the service, and encode its reply.
 
-The process reads stored objects itself, so that the worker never holds a map in memory.
+`encode_request` and `decode_reply` are called in the worker, on the other side of the process's socket.  The
+process reads the objects that a command refers to itself, so that the worker never holds a map in memory.
 """
 
 from __future__ import annotations
@@ -29,26 +29,36 @@ from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
 __all__ = ["TARGET", "configuration_of", "decode_reply", "encode_request", "make_handler"]
 
-TARGET = f"{__name__}:make_handler"
+TARGET = f"{__name__}:make_handler"  # the function with which a limited process begins
 _encode = msgspec.msgpack.Encoder(enc_hook=binary_encode_hook).encode
 _decode = msgspec.msgpack.Decoder(ext_hook=extension_hook).decode
 
 
 def configuration_of(services: str, settings: PlatformSettings) -> str:
-    """Return the text that `make_handler` takes; *services* is ``module:function``."""
+    """Return the argument of `make_handler` as JSON.
+
+    *services* is the ``module:function`` that returns the registry of services.
+    """
     return json.dumps({"services": services, "settings": settings.to_dict()})
 
 
 def encode_request(command: Command, robot: RobotId) -> bytes:
-    """Return the request for the handler of a process; raises BadRequest if it cannot be encoded."""
+    """Return *command* and *robot* as MessagePack, for the handler of a limited process.
+
+    Raises:
+        BadRequest: The payload cannot be encoded.
+    """
     try:
         return _encode([command.service, command.payload, command.trace, list(robot)])
     except (RsePfError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise BadRequest(f"the payload cannot be passed on: {message_of(error)[:150]}") from error
+        raise BadRequest(f"the payload cannot be encoded: {message_of(error)[:150]}") from error
 
 
 def decode_reply(data: bytes, command: Command, *, server: str) -> tuple[Result | Failure, str]:
-    """Return the answer to *command*, and the traceback of a defect of the service, for the log."""
+    """Return the answer to *command* in the bytes *data* of a limited process, and a text for the log.
+
+    The text is the traceback of an exception that the service should not raise, or "".
+    """
     compute_ms, reply, failure, defect = _decode(data)
     if failure is None:
         return Result(id=command.id, reply=reply, server=server, compute_ms=compute_ms), ""
@@ -60,20 +70,28 @@ def decode_reply(data: bytes, command: Command, *, server: str) -> tuple[Result 
 
 
 def make_handler(configuration: str) -> Handler:
-    """Import what limited services need and return the function that answers one of their commands."""
+    """Load and warm up the limited services, and return the function that answers one encoded command.
+
+    Args:
+        configuration: The result of `configuration_of`.
+    """
     order = json.loads(configuration)
     settings = PlatformSettings.from_dict(order["settings"])
     registry = load_services(order["services"], settings)
     for service in registry:
         if service.limited and service.warm_up is not None:
-            with contextlib.suppress(MissingExtra):  # the answer to each command says so
+            with contextlib.suppress(MissingExtra):  # each command of the service then gets this error
                 service.warm_up()
     store = open_data_store(settings) if is_shared(settings) else None
     return functools.partial(_answer, registry, settings, store)
 
 
 def _answer(registry: Registry, settings: PlatformSettings, store: ObjectStore | None, data: bytes) -> bytes:
-    """Answer one command; raises MemoryError, which ends the process."""
+    """Return the encoded answer to the encoded command *data*.
+
+    Raises:
+        MemoryError: The service exceeded the memory limit; the process then exits, and counts as crashed.
+    """
     name, payload, trace, robot = _decode(data)
     try:
         if store is not None:

@@ -390,7 +390,7 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
             # The transport would read on up to 256 KiB before the next socket.
             read_bytes = 0
             self._listener.hold()
-            self._poller.end_turn(self._listener.read_on)
+            self._poller.read_after_others(self._listener.read_on)
         self._read_bytes = read_bytes
 
     def connection_lost(self, error: Exception | None) -> None:

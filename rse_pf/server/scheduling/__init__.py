@@ -1,4 +1,5 @@
-"""The order in which commands are computed, and the event loop and threads that share the work.
+"""Which command a worker computes next, and how its event loop and its threads divide the work.
 
-Schedulers and queues belong here; the computation of a command, and its answer on the wire, do not.
+This package has the scheduler, the overload control, the interface of queues, the decoder thread, and the
+limits of time within one round of the event loop.  Computing and answering a command belong to `gateway`.
 """

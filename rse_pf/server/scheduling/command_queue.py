@@ -1,7 +1,7 @@
 """The interface of the queues in which commands wait for their answers, and the values that it passes.
 
-The dispatcher of a worker holds a list of queues and uses nothing else of them.  All methods are called in
-the event loop of the worker, and none of them blocks.
+The dispatcher of a worker has a list of queues, and passes each command to the first queue that offers its
+service.  All methods are called in the event loop of the worker, and none of them blocks.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ class QueuedCommand(msgspec.Struct, eq=False):
     """One command from its arrival to its answer; times are monotonic seconds.
 
     Attributes:
-        owner: The connection that waits for the answer.
+        owner: The `RobotConnection` that gets the answer.
         robot: The robot of that connection.
-        command: The command as decoded.
-        size_bytes: Its length on the wire.
-        received_s: When it arrived.
-        deadline_s: After this its answer is of no use.
-        started_s: When its computation began; 0 while it waits.
-        position: Its position when it was queued, from 1; a frame that replaces a waiting one inherits it.
-        queued_s: When that position was taken.
+        command: The decoded command.
+        size_bytes: Length of the message on the wire, in bytes.
+        received_s: Time at which the message arrived.
+        deadline_s: Time after which the answer is of no use.
+        started_s: Time at which the computation began; 0 while the command waits.
+        position: Position in the queue when the command was queued; 1 is the front.  A frame that replaces a
+            waiting frame of its stream takes over that frame's position.
+        queued_s: Time at which the command, or the first of the frames that it replaced, got that position.
     """
 
     owner: Any
@@ -46,16 +47,17 @@ class QueuedCommand(msgspec.Struct, eq=False):
 
     @property
     def allowed_s(self) -> float:
-        """Time from its arrival to its deadline."""
+        """Seconds from the arrival of the command to its deadline."""
         return self.deadline_s - self.received_s
 
 
 class QueueBacklog(NamedTuple):
-    """What would delay one more command of a robot.
+    """The load of a queue for one more command of a robot, from which its admission is decided.
 
     Attributes:
-        waiting: How many commands of the robot wait in the same queue.
-        pause_s: How long the robot has to pause because the command would wait for too long; 0 accepts it.
+        waiting: Number of commands of the robot that wait in the queue.
+        pause_s: 0 if the command may be queued; otherwise the server is overloaded, the command is refused,
+            and the robot has to pause for this many seconds.
     """
 
     waiting: int = 0
@@ -64,9 +66,9 @@ class QueueBacklog(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RefusedCommand:
-    """A command that is answered without being computed.
+    """A command that is answered with *error* instead of being computed.
 
-    ``reason`` is a label of the metric ``rse_pf_shed_total``.
+    ``reason`` is the label under which the metric ``rse_pf_shed_total`` counts it.
     """
 
     queued: QueuedCommand
@@ -79,10 +81,10 @@ class QueueReport:
     """The metrics of one queue.
 
     Attributes:
-        gauges: Values for ``/metrics``, by the name of the metric.
-        cpu_s: CPU seconds since the start of the worker, by kind of work, then by tenant, of work in other
-            processes; for sandboxes the elapsed time of their requests.
-        sections: Further parts of the worker's report, by their names.
+        gauges: Values for ``/metrics``, by the name of the gauge.
+        cpu_s: CPU seconds of other processes that work for this queue, since the start of the worker, by kind
+            of work, then by tenant; sandboxes count the elapsed seconds of their requests instead.
+        sections: Further parts of the worker's report to the supervisor, by name, such as ``isolation``.
     """
 
     gauges: Mapping[str, float] = field(default_factory=dict)
@@ -91,41 +93,51 @@ class QueueReport:
 
 
 class CommandQueue(Protocol):
-    """Commands that wait or run; a queue has this class as its base, and may leave the last methods out."""
+    """A queue of commands that wait or run.
+
+    Each queue derives from this class; `enter`, `give_up` and `close` do nothing unless it overrides them.
+    """
 
     checks_scope: bool = False
-    """Whether it checks the scopes of tokens itself, by more than the name of the service."""
+    """Whether the queue checks the scopes of the robot's token itself; if not, `Admission` requires the scope
+    ``services:SERVICE``."""
 
     @property
     def held(self) -> int:
-        """Commands that the worker must answer before it exits."""
+        """Number of commands that the worker must answer before it exits."""
 
     def offers(self, service: str) -> bool:
         """Return whether this queue takes commands to *service* now."""
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return what would delay *queued*, whose service this queue offers."""
+        """Return the load that decides whether *queued*, whose service this queue offers, is admitted."""
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Take *queued*, which was admitted at *now* (s); answer it once, unless its connection ends."""
+        """Queue *queued*, which was admitted at *now* (monotonic s), and answer it exactly once later.
+
+        It gets no answer if its connection closes before.
+        """
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """Cancel a command of the connection *owner*, unless it is answered soon."""
+        """Cancel the command *command_id* of the connection *owner*, because the robot sent Cancel.
+
+        A queue of short commands may ignore this, since they are answered soon anyway.
+        """
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
-        """Forget the connection *owner*, which ended; return its commands that are dropped."""
+        """Forget the connection *owner*, which was closed; return those of its commands that are dropped."""
 
     def report(self) -> QueueReport:
-        """Return the present metrics; none is reset."""
+        """Return the present metrics of the queue, and reset none of them."""
 
     def enter(self, owner: Any) -> None:
-        """Note the connection *owner*, whose handshake is done."""
+        """Note the new connection *owner*, whose handshake was accepted."""
         return
 
     def give_up(self) -> None:
-        """Leave to other servers what they can continue, because this server drains."""
+        """Give up the work that other servers can continue, because this server drains."""
         return
 
     def close(self) -> None:
-        """Stop the threads and processes of this queue; commands that are held may stay unanswered."""
+        """Stop the threads and processes of this queue; commands that wait or run may get no answer."""
         return

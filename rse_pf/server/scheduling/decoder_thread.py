@@ -1,9 +1,11 @@
-"""Decode long messages in a thread of their own, so that a decompression bomb delays only its sender.
+"""Decode long messages of robots in a thread, so that a decompression bomb does not stop the event loop.
 
-The event loop decodes short messages, such as commands for poses.  A message that is long, or inflates to
-more than `_MAX_INLINE_RATIO` times `INLINE_BYTES`, waits here.  Messages of robots that sent undecodable
-messages before are decoded last.  The messages of one robot keep their order, because `RobotConnection`
-defers what arrives while one of its messages is decoded here.
+1. The event loop decodes a message of at most `INLINE_BYTES`, such as a command for a pose, unless it
+   inflates to more than `_MAX_INLINE_RATIO` times `INLINE_BYTES`.
+2. Every other message waits here.  Messages of robots that sent undecodable messages before are decoded last;
+   otherwise messages are decoded in the order of their arrival.
+3. While a message of a robot waits or is decoded, `RobotConnection` defers the robot's further messages, so
+   that the messages of one robot keep their order.
 """
 
 from __future__ import annotations
@@ -20,15 +22,16 @@ from rse_pf.wire.messages import FromRobot
 
 __all__ = ["DecoderThread"]
 
-# A message that is decoded in the event loop may inflate to this many times `INLINE_BYTES`; numbers in JSON
+# A message that the event loop decodes may inflate to at most this many times `INLINE_BYTES`: numbers in JSON
 # inflate to two or three times their compressed size.
 _MAX_INLINE_RATIO = 4
 
 Done = Callable[[FromRobot | ProtocolError], None]
+"""Gets a decoded message, or the error of decoding it."""
 
 
 class DecoderThread:
-    """The decoder thread of one worker; it starts with the first long message."""
+    """The decoder thread of one worker, and the messages that wait for it; starts with the first message."""
 
     def __init__(
         self,
@@ -39,15 +42,16 @@ class DecoderThread:
         """Decode nothing yet.
 
         Args:
-            call_soon_threadsafe: Calls a function in the event loop.
-            crash: Notes whose message is decoded.
-            on_defect: Takes, in the event loop, an exception that a codec should not raise.
+            call_soon_threadsafe: Method of the event loop, which calls a function in its thread.
+            crash: Marks for which connection the thread works, in case the decoder crashes.
+            on_defect: Called in the event loop with an exception that a codec should not raise.
         """
         self.short_bytes = INLINE_BYTES
-        """A message up to this size, on the wire, is tried in the event loop."""
+        """Bytes on the wire up to which the event loop tries to decode a message."""
         self.short_inflated_bytes = _MAX_INLINE_RATIO * INLINE_BYTES
+        """Bytes after inflating up to which the event loop decodes such a message."""
         self.unread_bytes = 0
-        """Length of the messages that wait or are being decoded."""
+        """Bytes on the wire of all messages that wait for the thread or are being decoded."""
         self._call = call_soon_threadsafe
         self._crash = crash
         self._on_defect = on_defect
@@ -58,14 +62,15 @@ class DecoderThread:
         self._thread: threading.Thread | None = None
 
     def begin(self, codec: Codec, data: bytes, *, number: int, suspicion: int, done: Done) -> None:
-        """Decode *data* and call *done* once, in the event loop.
+        """Let the thread decode *data*; return at once, and call *done* once in the event loop afterwards.
 
         Args:
-            codec: The codec of the robot.
+            codec: The codec of the robot's connection.
             data: One whole message, which `Admission.may_wait` admitted.
-            number: Number of the connection.
-            suspicion: `ServerSession.suspicion` of the robot; messages with a smaller one are decoded first.
-            done: Gets the message, or the error of decoding it.
+            number: Number of the connection, for crash reports.
+            suspicion: How many bad messages the robot sent (`ServerSession.suspicion`); of the messages that
+                wait, the one with the smallest number is decoded first.
+            done: Gets the decoded message, or the error of decoding it.
         """
         with self._changed:
             self.unread_bytes += len(data)
@@ -77,7 +82,7 @@ class DecoderThread:
             self._thread.start()
 
     def close(self) -> None:
-        """Decode nothing more."""
+        """Stop the thread after the present message; messages that wait are not decoded."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()

@@ -1,7 +1,7 @@
-"""Do the work for unauthenticated clients in small steps, so that robots are served in between.
+"""Do the work for unauthenticated clients in small steps, so that connected robots are served in between.
 
-A step is a call that takes well under a millisecond.  The clock is an argument, and nothing here uses a
-socket.
+A step is a call of a function, such as one read of a handshake, that takes well under a millisecond.  In each
+round of the event loop steps run until a limit of time, and the others wait for the next round.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ __all__ = ["DeferredWork"]
 
 
 class DeferredWork:
-    """Steps that run oldest first, for a bounded time in each round of an event loop."""
+    """A queue of steps, first in, first out, that run for a bounded time in each round of an event loop."""
 
     def __init__(self, loop: AbstractEventLoop, *, clock: Callable[[], float], bound_s: float) -> None:
         """Hold no step yet.
 
         Args:
-            loop: Runs the steps.
-            clock: Seconds, monotonic.
-            bound_s: No further step begins in a round of *loop* after its steps have taken this long.
+            loop: The event loop in which the steps run.
+            clock: Returns monotonic seconds.
+            bound_s: Seconds after which no further step begins in the same round of *loop*.
         """
         self._loop = loop
         self._clock = clock
@@ -36,7 +36,7 @@ class DeferredWork:
         return len(self._steps)
 
     def add(self, step: Callable[..., object], *arguments: Any) -> None:
-        """Call *step* with *arguments* behind the steps that wait, never before this returns."""
+        """Call *step* with *arguments* after the steps that wait already, and never before `add` returns."""
         self._steps.append((step, arguments))
         self._plan()
 

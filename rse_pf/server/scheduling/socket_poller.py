@@ -1,8 +1,9 @@
 """Read the sockets of robots for a bounded time in each round of the event loop.
 
-libuv polls up to 48 times within one round while 1024 sockets are readable each time.  A worker that had
-fallen that far behind read for up to 3.9 s without running its timers.  The sockets of robots therefore have
-an epoll object of their own, which the event loop polls as one descriptor.
+Why the event loop does not poll these sockets itself: libuv polls up to 48 times within one round as long as
+1024 sockets are readable each time, and an overloaded worker read for up to 3.9 s without running its timers.
+The sockets of robots therefore have an epoll object of their own, which the event loop polls as one
+descriptor.  In each round `SocketPoller` reads sockets for `_MAX_READ_S`; the others wait for the next round.
 """
 
 from __future__ import annotations
@@ -14,14 +15,16 @@ from typing import Any
 
 __all__ = ["SocketPoller"]
 
-_AT_ONCE = 64  # sockets of one poll; the kernel returns first those that it has not returned for longest
-# No further socket is read in a round of the event loop after reading has taken this long.  With 0.008,
-# frames of robots that ignore their pauses stayed in the kernel beyond their deadline.
-_BOUND_S = 0.03
+_MAX_POLLED = 64  # sockets that one poll returns; the kernel returns those first that waited longest
+# Seconds of reading in one round of the event loop, after which no further socket is read.  With 0.008 s,
+# frames of robots that ignore their pauses stayed in the kernel beyond their deadlines.
+_MAX_READ_S = 0.03
 
 
 class SocketPoller:
-    """The part of an event loop that the transport of a socket uses.
+    """Takes the place of the event loop in the transports of robots' sockets, and polls these sockets.
+
+    All other methods of the event loop are passed on to it.
 
     Source:
         ``uv__io_poll`` of libuv (``src/unix/linux.c``); epoll(7).
@@ -31,25 +34,26 @@ class SocketPoller:
         """Read no socket yet.
 
         Args:
-            loop: Polls the own epoll object as one of its descriptors, and does all that is not reading.
-            clock: Seconds, monotonic.
+            loop: The event loop, which polls the epoll object of this poller as one descriptor.
+            clock: Returns monotonic seconds.
         """
         self._loop = loop
         self._clock = clock
         self._epoll = select.epoll()
         self._is_polled = False
         self._callbacks: dict[int, Callable[[], Any]] = {}
-        self._left: list[tuple[int, int]] = []
-        """Of the sockets asked for last, those that there was no time to read."""
-        self._turns_over: list[Callable[[], None]] = []
+        self._unread: list[tuple[int, int]] = []
+        """Descriptors and events that the last poll returned, and that there was no time to read."""
+        self._after_callback: list[Callable[[], None]] = []
+        """Called when the callback of the present socket has returned, see `read_after_others`."""
         self._leaves_unread = False
 
     def __getattr__(self, name: str) -> Any:
-        """Return a method of the event loop, for everything but reading."""
+        """Return the method *name* of the event loop, for everything but reading."""
         return getattr(self._loop, name)
 
     def add_reader(self, fd: int, callback: Callable[[], Any]) -> None:
-        """Call *callback* as long as the descriptor *fd* is readable."""
+        """Call *callback* whenever the descriptor *fd* is readable, until `remove_reader`."""
         if not self._is_polled:
             self._is_polled = True
             self._loop.add_reader(self._epoll.fileno(), self._read)
@@ -58,36 +62,40 @@ class SocketPoller:
         self._callbacks[fd] = callback
 
     def remove_reader(self, fd: int) -> bool:
-        """End what `add_reader` began; return whether there was anything."""
+        """Stop watching the descriptor *fd*; return whether it was watched."""
         if self._callbacks.pop(fd, None) is None:
             return False
         self._epoll.unregister(fd)
         return True
 
     def leaves_unread(self) -> bool:
-        """Return whether there was no time for some of the sockets when they were read last."""
+        """Return whether the last round left readable sockets unread, because its time was used up."""
         return self._leaves_unread
 
-    def end_turn(self, read_on: Callable[[], None]) -> None:
-        """Call *read_on* after the present callback has returned, so that its socket is read after others."""
-        self._turns_over.append(read_on)
+    def read_after_others(self, read_on: Callable[[], None]) -> None:
+        """Call *read_on* when the callback of the present socket has returned.
+
+        A transport that paused reading before continues then, and its socket is polled again after the other
+        readable sockets.
+        """
+        self._after_callback.append(read_on)
 
     def _read(self) -> None:
-        callbacks, turns_over, clock = self._callbacks, self._turns_over, self._clock
-        until_s = clock() + _BOUND_S
+        callbacks, after_callback, clock = self._callbacks, self._after_callback, self._clock
+        until_s = clock() + _MAX_READ_S
         while True:
-            readable = self._left or self._epoll.poll(0, _AT_ONCE)
-            self._left = []
+            readable = self._unread or self._epoll.poll(0, _MAX_POLLED)
+            self._unread = []
             for number, (fd, _) in enumerate(readable, 1):
                 callback = callbacks.get(fd)
-                if callback is not None:  # that of another socket may have ended it
+                if callback is not None:  # None if the callback of another socket has closed this socket
                     callback()
-                    while turns_over:
-                        turns_over.pop()()
+                    while after_callback:
+                        after_callback.pop()()
                     if clock() >= until_s:
-                        self._left = readable[number:]
+                        self._unread = readable[number:]
                         self._leaves_unread = True
                         return
-            if len(readable) < _AT_ONCE:
+            if len(readable) < _MAX_POLLED:
                 self._leaves_unread = False
                 return
