@@ -1,13 +1,13 @@
 """Decide whether a command is admitted or refused.
 
-Before a message is decoded, when a refusal costs least, the dispatcher checks:
+The dispatcher checks these limits in this order, the first three before it decodes a message, when a refusal
+costs least:
 
-1. the rate of the robot (`RobotRates`),
-2. the backlog of the server (`Scheduler.unread_pause_s`),
-3. for a long message, the bytes that wait for the decoder thread (`Admission.may_wait`).
-
-`Admission.refusal` checks the decoded command: its scope, its deadline, how many commands of the robot wait,
-and the backlog again, now that the deadline is known.
+1. the message rate of the robot (`RobotRates`),
+2. the overload of the server, by the deadline of the robot's last command (`Scheduler.unread_pause_s`),
+3. for a long message, the bytes that wait for the decoder thread (`Admission.may_wait`),
+4. for the decoded command, the scope of the token, the deadline, the number of commands of the robot that
+   wait, and the overload by the command's own deadline (`Admission.refusal`).
 
 Values go in and decisions come out: there is no clock, no queue and no connection here.
 """
@@ -27,15 +27,18 @@ from rse_pf.server.scheduling.scheduler import BEHIND, BEHIND_HINT, behind_error
 
 __all__ = ["DECODER_FULL", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
 
-MAX_QUEUE_PER_ROBOT = 8  # waiting commands of one robot: as many as it may have unanswered by default
-_MAX_UNREAD_BYTES = 1 << 24  # long messages that may wait for the decoder thread of a worker: 64 of 256 KiB
-_SUSPECTS_SHARE = 0.25  # of that, for robots that sent undecodable messages: they leave room to the others
+MAX_QUEUE_PER_ROBOT = 8  # commands of one robot in one queue: the default of ``session.max_in_flight``
+# Bytes of long messages that may wait for the decoder thread of a worker: 64 messages of the greatest size.
+_MAX_UNREAD_BYTES = 1 << 24
+# Share of `_MAX_UNREAD_BYTES` above which messages of robots that sent undecodable messages before are
+# refused, so that such robots cannot fill the decoder's queue.
+_SUSPECTS_SHARE = 0.25
 
 
 class UnreadRefusal(NamedTuple):
-    """Why a message is refused as ``busy`` before it is decoded.
+    """The text of a failure ``busy``, with which a message is refused before it is decoded.
 
-    ``reason`` is a label of the metric ``rse_pf_shed_total``.
+    ``reason`` is the label under which the metric ``rse_pf_shed_total`` counts the refusal.
     """
 
     reason: str
@@ -52,7 +55,7 @@ DECODER_FULL = UnreadRefusal(
 
 
 class Admission:
-    """The limits of one worker, and the token buckets of its robots."""
+    """Decides which messages and commands a worker refuses; ``rates`` has the token buckets of its robots."""
 
     def __init__(self, session: SessionSettings, *, max_queue: int = MAX_QUEUE_PER_ROBOT) -> None:
         self.rates = RobotRates(session)
@@ -66,9 +69,12 @@ class Admission:
     def may_wait(self, size_bytes: int, unread_bytes: int, bad_messages: int) -> bool:
         """Return whether a message that is too long for the event loop may wait for the decoder thread.
 
+        The limit for the bytes that wait is `_MAX_UNREAD_BYTES`, and a quarter of that for a robot that sent
+        undecodable messages.  If nothing waits, the message is always accepted.
+
         Args:
-            size_bytes: Length of the message on the wire.
-            unread_bytes: Length of the messages that wait for the decoder thread; one alone is always taken.
+            size_bytes: Length of the message on the wire, in bytes.
+            unread_bytes: Length of the messages that wait for the decoder thread already, in bytes.
             bad_messages: How many messages of the connection could not be decoded.
         """
         share = _SUSPECTS_SHARE if bad_messages else 1.0
@@ -77,12 +83,12 @@ class Admission:
     def refusal(
         self, queued: QueuedCommand, claims: Claims | None, backlog: QueueBacklog
     ) -> RefusedCommand | None:
-        """Return why a decoded command is refused; None if it is admitted.
+        """Return the refusal of a decoded command; None if the command is admitted.
 
         Args:
             queued: The command, with the times of its arrival and of its deadline.
-            claims: The claims of the robot's token; None where no token is required.
-            backlog: The commands that would delay *queued* in the queue that it would join.
+            claims: The claims of the robot's token; None if the scope is not checked here.
+            backlog: The load of the queue that *queued* would join, see `CommandQueue.backlog`.
         """
         service = queued.command.service
         if claims is not None and not is_in_scope(service, claims):
@@ -105,5 +111,5 @@ class Admission:
 
 
 def is_in_scope(service: str, claims: Claims) -> bool:
-    """Return whether a token allows commands to *service*."""
+    """Return whether *claims* allow commands to *service*; a token without scopes allows all services."""
     return not claims.scopes or scopes_allow(claims.scopes, f"services:{service}")

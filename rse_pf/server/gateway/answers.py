@@ -23,13 +23,13 @@ from rse_pf.wire.envelope import Envelope, encode_refusal
 
 __all__ = ["Answers", "EncodedAnswer"]
 
-_UNKNOWN = "unknown"
+_UNKNOWN = "unknown"  # name in metrics and log of all services that this server does not offer
+# Results that may occur hundreds of times in a second: they are logged at the level debug only.
 _FREQUENT = ("ok", Busy.code, "stale")
-"""Results of which there are hundreds in a second: they are counted, and logged at level debug only."""
 
 
 class EncodedAnswer(msgspec.Struct, frozen=True):
-    """The final answer to a command, and its bytes."""
+    """The final answer to a command: as a message, and encoded in the codec of its connection."""
 
     queued: QueuedCommand
     message: Result | Failure
@@ -37,7 +37,7 @@ class EncodedAnswer(msgspec.Struct, frozen=True):
 
 
 class Answers:
-    """Makes and sends the answers of one worker."""
+    """Computes, encodes and sends the answers of one worker to its robots."""
 
     def __init__(
         self, context: WorkerContext, *, registry: Registry, services: frozenset[str], objects: ObjectRefs
@@ -47,8 +47,9 @@ class Answers:
         Args:
             context: The clocks, log, metrics and settings of the worker.
             registry: The services that `compute` calls.
-            services: Names of all services of this server, also installed ones; others share one label.
-            objects: Puts stored objects into payloads, and large replies into the store.
+            services: Names of all services of this server, installed ones included; metrics and log name any
+                other service ``unknown``.
+            objects: Replaces references in payloads by stored objects, and stores large replies.
         """
         self.objects = objects
         self.with_objects = frozenset(
@@ -56,7 +57,7 @@ class Answers:
             for service in registry
             if objects.store is not None and takes_objects(service.request_type)
         )
-        """Services whose payloads may name stored objects."""
+        """Names of the services of the registry whose payloads may refer to stored objects."""
         self.registry = registry
         self._context = context
         self._services = services
@@ -65,13 +66,13 @@ class Answers:
         self._logs_frequent = context.log.writes("debug")
 
     def offer(self, services: frozenset[str]) -> None:
-        """Replace the names of all services of this server."""
+        """Set the names of all services of this server to *services*, since installed services changed."""
         self._services = services
 
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
-        """Call the service and encode its answer.
+        """Call the service of *queued* and return its encoded answer; an error becomes a Failure.
 
-        This may run in the event loop or in a thread: it changes no state that they share.
+        This may run in the event loop or in a solver thread: it changes no state that both use.
         """
         before = self._crash.compute_for(queued.owner.number)
         try:
@@ -92,14 +93,14 @@ class Answers:
         return self._encode_fitting(queued, message)
 
     def _unknown_service(self, queued: QueuedCommand) -> RsePfError:
-        """Return the error of a service that does not exist; it names the services that the token allows."""
+        """Return the error for an unknown service; its hint names the services that the token allows."""
         owner: RobotConnection = queued.owner
         scopes = () if owner.claims is None else owner.claims.scopes
         offered = [name for name in self.registry.names if scopes_allow(scopes, f"services:{name}")]
         return unknown_service(queued.command.service, offered)
 
     def _compute_with_objects(self, queued: QueuedCommand) -> EncodedAnswer:
-        """Compute the answer of a service whose payload may refer to stored objects; it may block."""
+        """Resolve the references of *queued* and compute its answer; blocks on the object store."""
         started = self._monotonic()
         try:
             command = self.objects.resolve_references(queued.command, self.registry, queued.owner.robot)
@@ -115,9 +116,10 @@ class Answers:
         return self.encode(queued, message, started)
 
     def encode(self, queued: QueuedCommand, message: Result | Failure, started_s: float) -> EncodedAnswer:
-        """Encode *message*, whose computation began at *started_s*; runs where `compute` may run.
+        """Return the encoded answer *message* to *queued*, for a computation that began at *started_s* (s).
 
-        Blocks on the object store if the reply is too large for a message.
+        A Result gets the time in the queue, and the times of arrival and sending.  A reply that is too large
+        for a message is stored as an object, which blocks on the object store.
         """
         if isinstance(message, Result):
             message = msgspec.structs.replace(
@@ -129,9 +131,15 @@ class Answers:
         return self._encode_fitting(queued, message)
 
     def send(self, answer: EncodedAnswer, now: float, *, counts_cpu: bool = True) -> None:
-        """Write *answer*, unless its robot has disconnected; count and log it in any case.
+        """Write *answer* to its robot, count it, and log it.
 
-        With *counts_cpu* the time of its computation is added to the CPU seconds of its tenant.
+        If the robot has disconnected, the answer is only counted and logged.  Answers of synthetic robots are
+        not counted.  Frequent results (`_FREQUENT`) are logged at level debug, except for weak poses.
+
+        Args:
+            answer: The encoded answer.
+            now: Present time, monotonic seconds.
+            counts_cpu: Whether the time of the computation is added to the CPU seconds of the robot's tenant.
         """
         queued, message = answer.queued, answer.message
         if isinstance(message, Result):
@@ -148,7 +156,7 @@ class Answers:
         connection.tap.observe_answer(answer.data, queued.command, message)
         connection.commands += 1
         connection.last_result = code
-        weak = _weakness(message)  # logged at the level of failures, since operators look for weak poses
+        weak = _weakness(message)  # weak poses are logged at the level of failures: operators search for them
         if code in _FREQUENT and not weak and not self._logs_frequent:
             return
         log = self._context.log
@@ -163,10 +171,13 @@ class Answers:
             )  # fmt: skip
 
     def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
-        """Send the answer of a sandbox, a job or a live map, which count their CPU seconds themselves."""
+        """Encode and send the answer of a sandbox, a job or a live map, and log and count it as `send` does.
+
+        No CPU seconds are added: these queues report their own (`QueueReport.cpu_s`).
+        """
         now = self._context.clocks.monotonic()
         if isinstance(message, Result):
-            # A job does not say when it began, only how long it took.
+            # A job reports how long its computation took, and not when it began.
             waited_s = (queued.started_s or now - message.compute_ms / 1e3) - queued.received_s
             queue_ms = max(0.0, waited_s) * 1e3
             message = msgspec.structs.replace(
@@ -175,7 +186,7 @@ class Answers:
         self.send(self._encode(queued, message), now, counts_cpu=False)
 
     def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
-        """Answer a command that is not computed."""
+        """Send the failure of a command that is refused, and count it under the reason of the refusal."""
         self._context.metrics.shed[refusal.reason] += 1
         self.send(self._encode_failure(refusal.queued, refusal.error), now)
 
@@ -187,14 +198,14 @@ class Answers:
         refusal: UnreadRefusal,
         retry_after_ms: float,
     ) -> None:
-        """Answer a message that is refused before it is decoded.
+        """Send the failure ``busy`` for a message that is refused before it is decoded, and count it.
 
         Args:
             connection: The connection of the robot.
-            envelope: Id and service of its command, None if they cannot be read.
-            size_bytes: Length of the message.
-            refusal: The reason of the refusal.
-            retry_after_ms: Milliseconds after which the robot may send again.
+            envelope: Id and service of the command, None if they cannot be read; the failure then has no id.
+            size_bytes: Length of the message on the wire, for the log.
+            refusal: The reason of the refusal, and the text of the failure.
+            retry_after_ms: Milliseconds after which the robot may send the command again.
         """
         session = connection.session
         assert session is not None
@@ -218,7 +229,10 @@ class Answers:
             )  # fmt: skip
 
     def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
-        """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
+        """Count and log a message of *size_bytes* that could not be decoded, and was answered by *failure*.
+
+        Without an id in *failure* the message is logged only.
+        """
         if failure.id is not None:
             if not connection.is_synthetic:
                 self._context.metrics.count_answer(_UNKNOWN, failure.code, 0.0)
@@ -234,7 +248,10 @@ class Answers:
         return service if service in self._services else _UNKNOWN
 
     def _encode_fitting(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
-        """Encode *message*; blocks for the store if the reply is too large for a message."""
+        """Return *message* encoded, with its reply as a stored object if it is too large for a message.
+
+        Storing blocks on the object store.  If the reply cannot be stored, the answer is a failure.
+        """
         answer = self._encode(queued, message)
         failure = answer.message
         if not isinstance(message, Result) or not isinstance(failure, Failure):
@@ -272,7 +289,7 @@ class Answers:
 
 
 def _weakness(message: Result | Failure) -> dict[str, str]:
-    """Return the log fields of a weak pose; empty for every other answer."""
+    """Return the log fields ``verdict`` and ``reason`` of a weak pose; none for every other answer."""
     reply = message.reply if isinstance(message, Result) else None
     if getattr(reply, "verdict", "") != "weak":
         return {}

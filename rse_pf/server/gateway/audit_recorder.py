@@ -1,8 +1,9 @@
 """Record the authentication of robots: accepted and refused handshakes, renewals, and revoked connections.
 
-`AuditRecorder` collects notes in a worker; `ServerAudit` writes them in the supervisor.  A handshake never
-waits for the log.  Refusals beyond a rate are counted instead of written one by one, and the names in an
-unverified token are recorded as claimed.
+`AuditRecorder` collects notes (entries before they are written) in a worker, and sends them to the
+supervisor, where `ServerAudit` writes them to the audit log.  A handshake never waits for the log.  Refusals
+beyond a rate (`RefusalLimiter`) are counted, and only their number is written.  Names from an unverified
+token are recorded as claimed.
 """
 
 from __future__ import annotations
@@ -22,13 +23,16 @@ from rse_pf.server.worker_context import Clocks
 
 __all__ = ["AuditRecorder", "ServerAudit"]
 
-_MAX_NOTES = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
-_SUM_UP_S = 10.0  # counted refusals are written as one entry this often
-_UNAUTHORIZED = 401
+_MAX_NOTES = 500  # notes in one message to the supervisor, which may have 1 MiB
+_SUM_UP_S = 10.0  # seconds from a refusal that is only counted to the entry with the counts
+_UNAUTHORIZED = 401  # HTTP status of a handshake that is rejected for its token
 
 
 class AuditRecorder:
-    """The notes of one worker, sent to the supervisor in batches; those that wait are lost if it crashes."""
+    """Collects the notes of one worker for the audit log, and sends them to the supervisor in batches.
+
+    If the worker crashes, the notes of the last `SYNC_S` seconds are lost.
+    """
 
     def __init__(
         self,
@@ -42,10 +46,10 @@ class AuditRecorder:
         """Hold nothing yet.
 
         Args:
-            clocks: Monotonic for the rate, wall for the entries.
-            loop: For the time of the next batch.
-            send: Sends a message to the supervisor.
-            is_on: Whether anything is recorded.
+            clocks: The clocks of the worker: monotonic for the rate limit, wall for the time of a note.
+            loop: The event loop of the worker, which sends the batches.
+            send: Sends its keyword arguments as a message to the supervisor.
+            is_on: Whether the server has an audit log; otherwise nothing is collected.
             refusals: Limits how many refusals are recorded one by one; None means the default limits.
         """
         self._clocks = clocks
@@ -60,7 +64,11 @@ class AuditRecorder:
     def record_verdict(
         self, verdict: Accepted | Rejected, source: str, token: str, keys: KeySet | None = None
     ) -> None:
-        """Record the verdict on a handshake with *token* from the address *source*, which *keys* gave."""
+        """Record that a handshake from the address *source* was accepted, or rejected for its *token*.
+
+        Rejections for other causes, and robots without a token, are not recorded.  *keys* has the roster,
+        from which the tenant of a robot that signs its own tokens is read.
+        """
         if isinstance(verdict, Accepted):
             if verdict.claims is not None:
                 fields = _token_fields(verdict.claims)
@@ -69,21 +77,21 @@ class AuditRecorder:
             self._note("auth.refused", "", reason=verdict.reason, source=source, **claimed_by(token, keys))
 
     def record_renewal(self, before: Claims, claims: Claims) -> None:
-        """Record the fresh token of a live connection; the same token again is not recorded."""
+        """Record that a connection got a fresh token, unless its id is that of the token *before*."""
         if claims.token_id != before.token_id:
             self._note("auth.renewed", str(claims.robot), **_token_fields(claims))
 
     def record_refused_renewal(self, before: Claims | None, reason: str) -> None:
-        """Record that the fresh token of a live connection was refused."""
+        """Record that a fresh token was refused for *reason*, on the connection with the claims *before*."""
         if self._may_record(reason):
             self._note("auth.renewal-refused", "" if before is None else str(before.robot), reason=reason)
 
     def record_cut_off(self, claims: Claims, reason: str) -> None:
-        """Record that a live connection was ended because its token is no longer valid."""
+        """Record that a connection was closed because its token is no longer valid, for *reason*."""
         self._note("auth.cut-off", str(claims.robot), **_token_fields(claims), reason=reason)
 
     def flush(self) -> None:
-        """Send the notes that are held, now."""
+        """Send all collected notes, and the counts of refusals, to the supervisor now."""
         self._sum_up()
         self._send()
 
@@ -117,10 +125,16 @@ class AuditRecorder:
 
 
 class ServerAudit:
-    """The audit log of one server; without a folder for it, nothing is recorded."""
+    """The audit log of one server, a context manager; without a folder nothing is recorded."""
 
     def __init__(self, folder: Path | None, server_id: str, *, on_problem: Callable[[str], None]) -> None:
-        """Open nothing yet; entering raises ConfigurationError if the log cannot be kept."""
+        """Open nothing yet; entering the context opens the log, or raises ConfigurationError.
+
+        Args:
+            folder: The folder of the audit log; None records nothing.
+            server_id: The name of the server, which is the actor of its entries.
+            on_problem: Called with a sentence when the log cannot be written.
+        """
         self._log = (
             None
             if folder is None
@@ -128,7 +142,7 @@ class ServerAudit:
         )
 
     def note(self, action: str, **detail: Value) -> None:
-        """Record an action of this server."""
+        """Record that this server did *action*, such as ``server.drain``, with the fields *detail*."""
         if self._log is not None:
             self._log.record(action, **detail)
 

@@ -31,11 +31,18 @@ import math
 
 __all__ = ["MAX_EARLY_COMMANDS", "PAUSE_S", "OverloadControl", "WaitPerPosition", "is_too_late"]
 
-# The shares are parts of the time from the arrival of a command to its deadline.
-MIN_WAIT_SHARE = 0.2  # no command with a shorter expected wait is refused: such a wait is no overload
-MAX_WAIT_SHARE = 0.5  # every command with a longer expected wait is refused: computing needs the rest
-MAX_QUEUED_SHARE = 0.75  # a command that has waited for longer is refused: its answer would come too late
-RESERVE_S = 1.5  # seconds for computing and network: a command with a long deadline may wait for all but this
+# Share of the time from arrival to deadline: a command with a shorter expected wait is always accepted.
+MIN_WAIT_SHARE = 0.2
+# Share of the time from arrival to deadline: a command with a longer expected wait is always refused, because
+# computation and network need the rest.
+MAX_WAIT_SHARE = 0.5
+# Share of the time from arrival to deadline: a queued command that has waited for longer is refused, because
+# its answer would come too late.
+MAX_QUEUED_SHARE = 0.75
+# Seconds that computation and network need at most.  A wait up to this time before the deadline is allowed
+# even if it exceeds `MAX_WAIT_SHARE` (with more than 3 s to the deadline) or `MAX_QUEUED_SHARE` (more than 6
+# s).
+RESERVE_S = 1.5
 PAUSE_S = 1.0  # mean pause of a refused robot in seconds: five frames of a camera at 5 Hz
 MAX_EARLY_COMMANDS = 8  # commands that a robot may send in one pause: so many may be in flight when it begins
 HALVING_S = 1.0  # seconds between halvings of the counts of accepted commands: several frames of each robot
