@@ -1,7 +1,7 @@
-"""One robot's connection inside a worker: it assembles frames into messages, and writes messages.
+"""One robot's connection inside a worker: it assembles frames to messages, and writes messages.
 
-Whole messages go to the dispatcher, and answers return through `RobotConnection.answer`.  The connection
-knows no socket library, and reads and writes nothing more once it is closing.
+Whole messages are passed to the dispatcher, and answers return through `RobotConnection.answer`.  The
+connection reads and writes through the interface `Wire` only, and does neither once it is closing.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ __all__ = ["RobotConnection"]
 
 
 class RobotConnection:
-    """One robot's connection between its handshake and its end."""
+    """One robot's connection, from its accepted handshake until its socket is closed."""
 
     __slots__ = (
         "_assembler", "_awaited_id", "_context", "_deferred", "_early_commands", "_receive", "_wire",
-        "allowed_s", "claims", "commands", "ignores_pauses", "is_connected", "last_heard_s", "last_result",
+        "allowed_s", "claims", "commands", "ignores_pauses", "is_connected", "last_message_s", "last_result",
         "moving_until_s", "number", "opened_s", "paused_until_s", "robot", "session", "tap",
         "tap_connection",
     )  # fmt: skip
@@ -48,10 +48,12 @@ class RobotConnection:
         Args:
             context: The settings, clocks, event loop and metrics of the worker.
             wire: The socket.
-            session: The rules of the protocol; None echoes messages, for conformance tests of WebSocket.
+            session: The state machine of the protocol; None echoes all messages, for conformance tests of
+                WebSocket.
             accepted: The robot, its claims and its codec, from the handshake.
-            receive: Called with the connection, its session, each whole message, and the time of its arrival.
-            now: Monotonic time in seconds, as all times here.
+            receive: Called with this connection, its session, each whole message, and the message's time of
+                arrival.
+            now: Present time; all times of this class are monotonic seconds.
             number: Number of the socket on this server, in the order of acceptance.
         """
         self.robot = accepted.robot
@@ -59,34 +61,35 @@ class RobotConnection:
         """The claims of the robot's token; None where no token is required."""
         self.session = session
         self.number = number
-        self.opened_s = self.last_heard_s = now
+        self.opened_s = self.last_message_s = now
         self.allowed_s = context.settings.session.answer_timeout_s
-        """Seconds that the last command had from its arrival to its deadline."""
+        """Seconds from the arrival of the robot's last command to its deadline."""
         self.paused_until_s = float("-inf")
-        """The robot has to pause until this time, as long as commands wait."""
+        """End of the robot's pause; until then its commands are refused while commands of robots wait."""
         self.ignores_pauses = False
-        """Whether the robot sent more than `MAX_EARLY_COMMANDS` in a pause.  While commands wait, it is then
-        read one command at a time and no longer refused, until it connects again."""
+        """Whether the robot sent more than `MAX_EARLY_COMMANDS` in one pause.  Until it connects again, its
+        commands are then not refused for overload, and the next one is read when the last one is answered."""
         self._early_commands = 0
         self._awaited_id: int | None = None
         self.commands = 0
-        """How many of its commands were answered."""
+        """Number of commands of this connection that were answered."""
         self.last_result = ""
-        """The result of the last of them: ``ok`` or the code of a failure."""
+        """Result of the last answered command: ``ok`` or the code of a failure; "" before."""
         self.moving_until_s = float("-inf")
+        """Time until which the robot has to move to another server; in the past if it was not asked to."""
         self.is_connected = True
         self._receive = receive
         self._context = context
         self.tap = NullMessageTap() if session is None else context.tap
-        """Observes the messages of the connection, whose number for the tap is ``tap_connection``."""
+        """Observes the messages for a recording; there the connection has the number ``tap_connection``."""
         self.tap_connection = (
             0 if session is None else self.tap.open_connection(session.codec.name, accepted.robot)
         )
         self._wire = wire
         self._assembler = FrameAssembler(context.settings.session)
         self._deferred: deque[tuple[bytes, bool]] | None = None
-        """Messages that arrived while one of this robot is decoded in a thread, or while a command must be
-        answered first; None if messages are passed on at once."""
+        """Messages, and whether each is text, that wait until an earlier message is decoded in a
+        thread, or until a command is answered; None if messages are passed to the dispatcher at once."""
 
     @property
     def is_closing(self) -> bool:
@@ -95,26 +98,30 @@ class RobotConnection:
 
     @property
     def is_synthetic(self) -> bool:
-        """Whether the robot belongs to the platform, such as the canary, and does not count as load."""
+        """Whether the robot is a part of the platform, such as the canary; metrics do not count it."""
         return self.claims is not None and SYNTHETIC in self.claims.scopes
 
     @property
     def is_opening(self) -> bool:
-        """Whether the robot has not said Hello yet."""
+        """Whether the robot has not sent its Hello yet."""
         return self.session is not None and self.session.state == "opening"
 
     @property
     def is_shown(self) -> bool:
-        """Whether operators see the robot: it said Hello, and does not belong to the platform."""
+        """Whether operators see the robot: it sent its Hello, and is not synthetic."""
         return self.session is not None and not self.is_opening and not self.is_synthetic
 
     @property
     def may_move(self) -> bool:
-        """Whether the robot said Hello and can be asked to move to another server."""
+        """Whether the robot sent its Hello, and can be asked to move to another server."""
         return self.session is not None and self.session.state == "open" and not self._assembler.closed
 
     def receive_frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
-        """Receive one unmasked frame."""
+        """Handle one WebSocket frame, given by its opcode, FIN bit, reserved bits and unmasked payload.
+
+        The frame completes a message, which is passed on, is answered by a pong, closes the connection, or
+        waits for the other fragments of its message.
+        """
         now = self._context.clocks.monotonic()
         decision = self._assembler.receive(opcode, fin, rsv, payload, now)
         if isinstance(decision, Received):
@@ -126,7 +133,10 @@ class RobotConnection:
             self._wire.close(decision.code, decision.reason)
 
     def answer(self, data: bytes, command_id: int) -> None:
-        """Write the final answer to a command; does nothing if the socket is closed."""
+        """Write the encoded answer *data* to the command *command_id*; write nothing if the socket is closed.
+
+        If reading was held until this answer (`hold_until_answered`), it continues.
+        """
         session = self.session
         if self.is_connected and session is not None:
             session.in_flight -= 1
@@ -139,71 +149,72 @@ class RobotConnection:
                 self.tap.observe_sent(self.tap_connection, data)
 
     def write(self, data: bytes) -> None:
-        """Write one message, unless the connection is closing."""
+        """Write one encoded message, unless the connection is closing."""
         if not self._assembler.closed:
             self._context.metrics.bytes_out += len(data)
             self._wire.send(data, self.session is not None and self.session.codec.is_text)
             self.tap.observe_sent(self.tap_connection, data)
 
     def write_progress(self, progress: Progress) -> None:
-        """Write the progress of a long command, if the robot is connected and announced the capability."""
+        """Write the progress of a job, if the robot is connected and its Hello has that capability."""
         if self.is_connected and self.session is not None and self.session.hears_progress:
             self.write(self.session.codec.encode(progress))
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that were written and that the kernel has not taken, because the robot reads slowly."""
+        """Bytes in this process's write buffer: written here, and not yet taken by the kernel."""
         return self._wire.unsent_bytes()
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Limit the bytes of this connection that the kernel holds and has not sent to *max_bytes*."""
+        """Let the kernel accept bytes of this connection only while fewer than *max_bytes* are unsent."""
         self._wire.bound_unsent(max_bytes)
 
     def refuse_updates(self, identity: int, error: RsePfError) -> None:
-        """Write that a subscription ends because of *error*."""
+        """Write a failure that ends the subscription with the id *identity* because of *error*."""
         if self.is_connected and self.session is not None:
             self.write(self.session.refuse_updates(identity, error).data)
 
     def move(self, reason: str, within_ms: float, now: float) -> None:
-        """Ask the robot to move to another server within *within_ms*."""
+        """Ask the robot to connect to another server within *within_ms*; *reason* is part of the message."""
         if self.session is not None:
             self.moving_until_s = now + within_ms / 1e3
             for message in self.session.move(reason, within_ms):
                 self.write(message.data)
 
     def answer_renewal(self, token_s: float | None) -> None:
-        """Send that the fresh token is valid for *token_s* seconds, or with None that it was refused."""
+        """Write that the fresh token is valid for *token_s* seconds, or with None that it was refused."""
         if self.session is not None:
             self.write(self.session.answer_renewal(token_s).data)
 
     def pause(self, seconds: float, now: float) -> None:
-        """Note that the robot was refused, and has to pause."""
+        """Note that a command was refused at *now*, so that the robot has to pause for *seconds*."""
         self.paused_until_s, self._early_commands = now + seconds, 0
 
     def note_early(self) -> None:
-        """Count a command that the robot sent in its pause."""
+        """Count a command that the robot sent in its pause; above the limit, set ``ignores_pauses``."""
         self._early_commands += 1
         self.ignores_pauses |= self._early_commands > MAX_EARLY_COMMANDS
 
     def read_rarely(self, seconds: float) -> None:
-        """Read nothing from the socket for *seconds*, because its last message was bad."""
+        """Read nothing from the socket for *seconds*, because its last message could not be decoded."""
         self._wire.pause(seconds)
 
     def hold_until_answered(self, command_id: int) -> None:
-        """Read nothing more until the command *command_id* is answered; messages that were read wait, too."""
+        """Read nothing more until the command *command_id* is answered, and defer messages read already."""
         self._awaited_id = command_id
         if self._deferred is None:
             self.defer()
 
     def defer(self) -> None:
-        """Read nothing more from the socket, and keep the messages that were read already."""
+        """Read nothing more from the socket until `resume`, and keep messages that were read already."""
         self._deferred = deque()
         self._wire.hold()
 
     def resume(self, follow: Callable[[], None]) -> None:
-        """Call *follow* for the message that was decoded in a thread, then take the deferred messages.
+        """End `defer`: call *follow*, which handles the message that was decoded, then the deferred messages.
 
-        *follow* is not called if the connection is closing or gone.
+        *follow* is not called if the connection is closing or closed.  Deferred messages wait on if a command
+        must be answered before (`hold_until_answered`).
         """
         if self.is_connected and not self._assembler.closed:
             works_for = self._context.crash.of_loop
@@ -226,19 +237,22 @@ class RobotConnection:
         self._wire.read_on()
 
     def close(self, code: int, reason: str) -> None:
-        """Close the socket and read nothing more from it."""
+        """Send a close frame with *code*, and count the connection as closed for *reason*.
+
+        Nothing more is read or written.
+        """
         self._context.metrics.closed[reason] += 1
         self._assembler.closed = True
         self._wire.close(code, reason)
 
     def end(self) -> None:
-        """Note that the socket has ended: nothing more is written."""
+        """Note that the socket was closed, so that nothing more is written."""
         self.is_connected = False
         self.tap.close_connection(self.tap_connection)
 
     def _take(self, data: bytes, is_text: bool, now: float) -> None:
-        """Pass on or defer one whole message; without a session, echo it."""
-        self.last_heard_s = now
+        """Pass one whole message to the dispatcher, or defer it; without a session, echo it."""
+        self.last_message_s = now
         session = self.session
         if self._deferred is not None:
             self._deferred.append((data, is_text))

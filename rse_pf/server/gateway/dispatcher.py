@@ -1,11 +1,12 @@
 """Receive the messages of all connections of one worker, and pass their commands to queues.
 
-1. `_refuse_unread`: the robot's rate and the backlog of the server are checked before a message is decoded.
-2. `_receive`: a short message is decoded in the event loop, a long one in the decoder thread.
-3. `_execute`: what the session decided about the message is done.
-4. `submit`: a command is admitted or refused, and the first queue that offers its service answers it.
+1. `_refuse_unread` refuses a message before it is decoded if its robot exceeds its rate, or if the server is
+   overloaded.
+2. `_receive` decodes a short message in the event loop, and has a long one decoded in the decoder thread.
+3. `_execute` carries out the decisions of the session (`rse_pf.wire.server_session`) about the message.
+4. `submit` admits or refuses a command, and passes it to the first queue that offers its service.
 
-No socket library is known here: `RobotConnection` gives messages, and writes through a `Wire`.
+Nothing here uses a socket: `RobotConnection` passes messages, and writes through a `Wire`.
 """
 
 from __future__ import annotations
@@ -50,14 +51,17 @@ from rse_pf.wire.server_session import (
 
 __all__ = ["Dispatcher"]
 
-# Pause before a refused long message is sent again: one that inflates to the limit is decoded within it.
+# Milliseconds after which a robot may send a long message again that was refused because the decoder thread
+# has too much to decode: a message that inflates to the greatest size is decoded in this time.
 _DECODER_RETRY_MS = 500.0
-# A socket is not read for this time, multiplied by the number of its messages that could not be decoded.
+# After a message that could not be decoded, its socket is not read for this many seconds, multiplied by the
+# number of such messages on the connection.
 _BAD_MESSAGE_PAUSE_S = 0.1
-# Bad messages with a readable id that count for the pause: clients take 1 s of silence for a lost connection.
+# At most this many undecodable messages with a readable id count for that pause, so that they cause no more
+# than 0.5 s: clients take 1 s without a message for a lost connection.
 _MAX_REFUSED = 5
+# Gauges of a server without jobs: alarms read them of every server.
 _NO_JOBS = {"jobs": 0.0, "jobs_pending": 0.0}
-"""Gauges that alarms read of every server, also of one without jobs."""
 
 
 class Dispatcher:
@@ -72,15 +76,16 @@ class Dispatcher:
         queues: Sequence[CommandQueue] = (),
         updates: LiveMapRouter | None = None,
     ) -> None:
-        """Take no connection yet; `start` begins to look for idle ones.
+        """Have no connection yet; `start` begins to close idle ones.
 
         Args:
             context: The settings, clocks, event loop and log of the worker.
-            answers: Computes and sends answers; its registry names the services of this process.
-            token_watch: Closes connections whose token is no longer valid; shares its set of connections.
-            queues: Queues of commands, in addition to that of stateless services; the first that offers a
-                service takes its commands.
-            updates: Takes subscriptions to live maps; one of *queues*, or None if live maps are off.
+            answers: Computes and sends answers; its registry has the services that this process runs.
+            token_watch: Closes connections whose token is no longer valid; its set of connections is used
+                here, too.
+            queues: The queues before the queue of stateless services; the first queue that offers a service
+                gets its commands.
+            updates: Handles subscriptions to live maps; one of *queues*, or None if live maps are off.
         """
         settings = context.settings
         self.context = context
@@ -105,17 +110,20 @@ class Dispatcher:
         self._lag_s = 0.0
 
     def start(self) -> None:
-        """Begin to look for idle connections."""
+        """Begin to check periodically for idle connections, and to close them."""
         now = self.context.clocks.monotonic()
         self.context.loop.call_later(self._idle_timeouts.until_tick_s(now), self._tick)
 
     @property
     def held(self) -> int:
-        """Commands that must be answered before the worker exits."""
+        """Number of commands, in all queues, that must be answered before the worker exits."""
         return sum(queue.held for queue in self._queues)
 
     def connect(self, wire: Wire, accepted: Accepted, number: int = 0) -> RobotConnection:
-        """Return a new connection for an accepted handshake; *number* is the number of its socket."""
+        """Return a new connection for an accepted handshake, after all queues were notified of it.
+
+        *number* is the number of the socket on this server, in the order of acceptance.
+        """
         now = self.context.clocks.monotonic()
         expires_s = (
             None if accepted.expires_s is None else now + accepted.expires_s - self.context.clocks.wall()
@@ -147,7 +155,7 @@ class Dispatcher:
         self.context.log.error("defect", traceback=text)
 
     def disconnect(self, connection: RobotConnection) -> None:
-        """Forget a connection whose socket ended, and its commands that wait."""
+        """Forget a connection whose socket was closed, and drop those of its commands that wait."""
         connection.end()
         self._token_watch.forget(connection)
         if connection in self.connections:
@@ -161,7 +169,7 @@ class Dispatcher:
             self.context.log.info("robot-offline", robot=connection.robot)
 
     def _greet(self, connection: RobotConnection, now: float) -> None:
-        """Report that a robot said Hello; if the server drains, ask it to move to another one at once."""
+        """Report that a robot sent its Hello; if this server drains, ask it to move to another server."""
         if connection.is_shown:
             self.context.log.info("robot-online", robot=connection.robot)
         self._token_watch.report_hello(connection)
@@ -169,7 +177,10 @@ class Dispatcher:
             connection.move(*self._move, now)
 
     def move_all(self, reason: str, within_ms: float) -> None:
-        """Ask every robot to move to another server, also those that connect from now on."""
+        """Ask every robot to move to another server within *within_ms*, because this server drains.
+
+        Robots that connect later are asked at their Hello.
+        """
         self._move = (reason, within_ms)
         for queue in self._queues:
             queue.give_up()
@@ -178,7 +189,10 @@ class Dispatcher:
             connection.move(reason, within_ms, now)
 
     def close_all(self) -> None:
-        """Close every socket; commands that are held stay unanswered, so wait until `held` is 0 before."""
+        """Close every socket, and all queues.
+
+        Commands that wait or run get no answer, so the caller first waits until `held` is 0.
+        """
         for connection in list(self.connections):
             connection.close(CLOSE_GOING_AWAY, "leaving")
         self.decoder.close()
@@ -186,7 +200,7 @@ class Dispatcher:
             queue.close()
 
     def _receive(self, connection: RobotConnection, session: ServerSession, data: bytes, now: float) -> None:
-        """Refuse one whole message, decode it at once, or pass it to the decoder thread."""
+        """Refuse one whole message, or decode it: a short one at once, a long one in the decoder thread."""
         if session.state == "open" and self._refuse_unread(connection, session, data, now):
             return
         state, suspicion = session.state, session.suspicion
@@ -209,7 +223,10 @@ class Dispatcher:
     def _refuse_unread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> bool:
-        """Refuse the message *data* for a fraction of the cost of decoding; False if it must be decoded."""
+        """Refuse the message *data* without decoding it, and return True; return False if it may be decoded.
+
+        The connection of a robot that ignored many refusals for its rate is closed.
+        """
         answers = self._answers
         codec = session.codec
         # 1. The rate of the robot.
@@ -222,13 +239,16 @@ class Dispatcher:
         if retry_ms:
             answers.refuse_unread(connection, peek(codec, data), len(data), self.admission.too_fast, retry_ms)
             return True
-        # 2. The backlog of the server, or the rest of a pause; a robot that ignores pauses is not refused.
+        # 2. The overload of the server, or the rest of a pause.  A robot that ignores pauses is not refused:
+        # it
+        #    is read one command at a time.
         scheduler = self.stateless.scheduler
         if connection.ignores_pauses or not scheduler.waiting:
             return False
         early_s = max(0.0, connection.paused_until_s - now)
         pause_s = early_s or scheduler.unread_pause_s(connection.robot, connection.allowed_s)
-        # 3. Only commands for the queue that is behind are refused; their id and service are read for that.
+        # 3. Only commands for the queue of stateless services are refused: the overload is that of this
+        # queue.
         envelope = peek(codec, data) if pause_s else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
@@ -264,7 +284,11 @@ class Dispatcher:
         state: str,
         suspicion: int,
     ) -> None:
-        """Execute what the session decided about one message; *state* and *suspicion* are those before it."""
+        """Execute the *decisions* of the session about one message of *size_bytes*.
+
+        Then pause reading if the message could not be decoded, or greet the robot if it was its Hello.
+        *state* and *suspicion* are those of the session before the message.
+        """
         for decision in decisions:
             self._execute(connection, decision, size_bytes, now)
         if session.bad_messages > MAX_BAD_MESSAGES:
@@ -273,7 +297,7 @@ class Dispatcher:
         if connection.is_closing:
             return
         if session.suspicion > suspicion:
-            # Refusing a bad message costs as much as reading it, so the socket is read more and more rarely.
+            # Refusing a bad message costs as much as decoding a good one, so the pauses grow with each.
             self.context.metrics.shed["bad-message"] += 1
             counted = session.bad_messages + min(session.refused_commands, _MAX_REFUSED)
             connection.read_rarely(counted * _BAD_MESSAGE_PAUSE_S)
@@ -302,7 +326,16 @@ class Dispatcher:
                     self._updates.unsubscribe(connection, decision.id)
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
-        """Admit one command to the queue of its service, or refuse it."""
+        """Pass one command to the first queue that offers its service, or send a refusal.
+
+        A cheap command on an idle server is answered at once.
+
+        Args:
+            connection: The connection of the robot.
+            command: The decoded command.
+            size_bytes: Length of the message on the wire.
+            now: Time of arrival, monotonic seconds.
+        """
         deadline_ms = command.deadline_ms
         allowed_s = self._answer_timeout_s if deadline_ms is None else deadline_ms / 1e3
         connection.allowed_s = allowed_s
@@ -331,7 +364,7 @@ class Dispatcher:
             self._answers.send(self._answers.compute(queued), now)
 
     def _subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
-        """Begin the updates of *topic* for the subscription *identity*, or refuse it."""
+        """Begin to send the updates of *topic* to the subscription *identity*, or refuse the subscription."""
         if self._updates is not None:
             self._updates.subscribe(connection, identity, topic)
         else:
@@ -339,7 +372,7 @@ class Dispatcher:
             connection.refuse_updates(identity, error)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the metrics of this worker for /metrics and /status."""
+        """Return the counters, gauges and sections of this worker's report; restart the event loop's lag."""
         reports = [queue.report() for queue in self._queues]
         metrics = self.context.metrics
         gauges = {
@@ -361,7 +394,7 @@ class Dispatcher:
         return {**metrics.snapshot(), **sections}
 
     def _queue_of(self, service: str) -> CommandQueue | None:
-        """Return the queue of *service*, None if this server does not offer the service."""
+        """Return the first queue that offers *service*, None if this server does not offer the service."""
         for queue in self._queues:
             if queue.offers(service):
                 return queue

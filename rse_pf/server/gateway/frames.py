@@ -1,7 +1,7 @@
-"""Assemble WebSocket frames into messages by RFC 6455, and close the connection that breaks it or a limit.
+"""Assemble WebSocket frames to messages by RFC 6455, and close a connection that violates it or a limit.
 
-Frames and times go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).  At most one message is
-held, of at most ``session.max_message_bytes``.
+Frames and times go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).  At most one incomplete
+message is in memory, of at most ``session.max_message_bytes``.
 """
 
 from __future__ import annotations
@@ -33,33 +33,36 @@ CLOSE = 8
 PING = 9
 PONG = 10
 
+# Close codes: RFC 6455, 7.4.1.
 CLOSE_NORMAL = 1000
 CLOSE_PROTOCOL_ERROR = 1002
 CLOSE_INVALID_TEXT = 1007
 CLOSE_POLICY = 1008
 CLOSE_TOO_BIG = 1009
 
-MAX_CONTROL_PER_S = 10.0  # control frames of one socket: a robot sends a ping every other second
+# Pings and pongs of one socket a second, and as many at once: a robot sends one ping in two seconds.
+MAX_CONTROL_PER_S = 10.0
 _CONTROL = (CLOSE, PING, PONG)
-_MAX_CONTROL = 125  # bytes in a control frame: RFC 6455, 5.5
+_MAX_CONTROL = 125  # payload bytes of a control frame: RFC 6455, 5.5
+# Close codes below 3000 that a close frame may carry; codes from 3000 to 4999 are free for applications.
 _KNOWN_CLOSE_CODES = frozenset({1000, 1001, 1002, 1003, 1007, 1008, 1009, 1010, 1011, 1012, 1013, 1014})
 
 
 class Received(msgspec.Struct, frozen=True, gc=False):
-    """One whole message; text is valid UTF-8."""
+    """Decision: pass this whole message on; if it is text, it is valid UTF-8."""
 
     data: bytes
     is_text: bool
 
 
 class SendPong(msgspec.Struct, frozen=True, gc=False):
-    """Answer a ping frame."""
+    """Decision: answer a ping by a pong frame with this payload."""
 
     data: bytes
 
 
 class CloseSocket(msgspec.Struct, frozen=True, gc=False):
-    """Send a CLOSE frame with this code, then end the connection."""
+    """Decision: send a CLOSE frame with this code and reason, then close the connection."""
 
     code: int
     reason: str = ""
@@ -69,7 +72,7 @@ FrameDecision = Received | SendPong | CloseSocket
 
 
 class FrameAssembler:
-    """The message of one socket whose frames have arrived in part."""
+    """Assembles the frames of one socket to messages; ignores all frames once it is ``closed``."""
 
     __slots__ = (
         "_control_frames",
@@ -91,7 +94,17 @@ class FrameAssembler:
         self._control_frames = TokenBucket(max_control_per_s, max_control_per_s)
 
     def receive(self, opcode: int, fin: bool, rsv: bool, payload: bytes, now: float) -> FrameDecision | None:
-        """Return the decision about one unmasked frame that arrived at *now* (s); None waits for more."""
+        """Return the decision about one frame that arrived at *now* (s); None if nothing is to be done.
+
+        That is after a pong, after a fragment that does not end its message, and once the socket is closed.
+
+        Args:
+            opcode: Kind of the frame: RFC 6455, 5.2.
+            fin: Whether the frame ends its message.
+            rsv: Whether a reserved bit is set, which closes the connection.
+            payload: The unmasked payload.
+            now: Seconds, monotonic; limits control frames to `MAX_CONTROL_PER_S`.
+        """
         if self.closed:
             return None
         if rsv:
@@ -163,24 +176,29 @@ class FrameAssembler:
 
 
 class CloseBorder:
-    """Find the end of the first CLOSE frame in a byte stream.
+    """Find the end of the first CLOSE frame in the bytes of a socket, by the headers of its frames.
 
-    Bytes behind a CLOSE frame must be ignored (RFC 6455, 5.5.1), but picows parses one frame ahead, and would
-    answer invalid bytes behind the CLOSE before the CLOSE itself.  Only the headers of frames are read here.
+    Bytes behind a CLOSE frame must be ignored (RFC 6455, 5.5.1).  picows parses one frame ahead, and would
+    answer invalid bytes behind the CLOSE frame before the CLOSE frame itself.
+
+    ``shut`` is whether the CLOSE frame has ended, ``is_upgraded`` whether the request head has ended.
     """
 
     __slots__ = ("_head", "_is_close", "_left", "is_upgraded", "shut")
 
     def __init__(self, *, upgraded: bool = False) -> None:
-        """Begin with the head of the handshake, or behind it if *upgraded*."""
+        """Expect the request head of the handshake first, or frames if *upgraded*."""
         self.shut = False
         self.is_upgraded = upgraded
-        self._head = b""
-        self._left = 0
+        self._head = b""  # bytes of a request head or of a frame header that has arrived in part
+        self._left = 0  # payload bytes of the present frame that have not arrived
         self._is_close = False
 
     def bytes_to_close(self, data: memoryview, n: int) -> int:
-        """Return how many of the next bytes, the first *n* of *data*, are not behind a CLOSE frame."""
+        """Read the next bytes, the first *n* of *data*, and return how many are not behind a CLOSE frame.
+
+        The count includes the CLOSE frame itself, and is 0 once that frame has ended.
+        """
         if self.shut:
             return 0
         payload_left = self._left
@@ -198,6 +216,7 @@ class CloseBorder:
         return n if start < 0 else self._walk(data, start)
 
     def _end_of_request(self, data: memoryview) -> int:
+        """Return the index in *data* behind the request head, -1 if the head has not ended yet."""
         head = self._head + bytes(data)
         blank = head.find(b"\r\n\r\n")
         if blank < 0:
@@ -208,6 +227,7 @@ class CloseBorder:
         return start
 
     def _walk(self, data: memoryview, i: int) -> int:
+        """Read the frames of *data* from index *i*; return the index behind a CLOSE frame, or the length."""
         n = len(data)
         while i < n:
             if self._left:
@@ -222,6 +242,7 @@ class CloseBorder:
         return n
 
     def _read_head(self, data: memoryview, i: int) -> int:
+        """Read the header of a frame at index *i* and return the index behind it, or behind all of *data*."""
         head = self._head + bytes(data[i : i + 14 - len(self._head)])
         length = _head_length(head)
         if length > len(head):
@@ -235,6 +256,7 @@ class CloseBorder:
 
 
 def _head_length(head: bytes | memoryview) -> int:
+    """Return the length of the frame header that *head* begins, as far as its first two bytes are there."""
     if len(head) < 2:
         return 2
     size = head[1] & 127
@@ -242,6 +264,7 @@ def _head_length(head: bytes | memoryview) -> int:
 
 
 def _payload_length(head: bytes | memoryview) -> int:
+    """Return the payload length that the whole frame header *head* states."""
     size = head[1] & 127
     if size == 126:
         return int.from_bytes(head[2:4], "big")

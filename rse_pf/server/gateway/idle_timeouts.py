@@ -1,9 +1,14 @@
-"""Close idle connections: no Hello in time, or no message for longer than ping interval and ping timeout.
+"""Close the connections of robots that sent no Hello in time, or no message for too long.
 
-Only the silence of the robot counts.  Time in which the worker itself was stopped is not counted, and a
-connection is closed only after its socket was read once more.  A connection is closed at the first tick after
-its limit, and ticks are far shorter than ``session.ping_timeout_s``.  Time is an argument: there is no clock
-and no event loop here.
+The limits are ``session.hello_timeout_s`` for the Hello, and ping interval plus ping timeout for messages.
+
+1. At each tick, at most `_MAX_TICK_S` apart, the connections whose limit has passed become suspects.
+2. The next tick comes `_READ_S` later.  The event loop reads the sockets before it, and a suspect that has
+   sent nothing meanwhile is closed.
+3. If a tick is at least `_STOPPED_S` late, the process was stopped.  This delay is added to the limits of all
+   connections, because only the silence of a robot counts.
+
+Time is an argument: there is no clock and no event loop here.
 """
 
 from __future__ import annotations
@@ -16,19 +21,20 @@ from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_PROTOCOL
 
 __all__ = ["IdleTimeouts", "max_silence_s"]
 
-_MAX_TICK_S = 0.25  # longest time between two ticks: a small part of every limit
-_TICKS_PER_LIMIT = 4  # a short Hello timeout has this many ticks
-_READ_S = 0.001  # time until the second look: an event loop reads its sockets before it waits for a timer
-_STOPPED_S = 1.0  # a tick this late was not delayed by work: the process was stopped, swapped out or frozen
+_MAX_TICK_S = 0.25  # longest time between two ticks, in seconds: a small part of the usual limits
+_TICKS_PER_LIMIT = 4  # smallest number of ticks within the Hello timeout, which may be short
+# Seconds from a tick with suspects to the next tick: the event loop reads its sockets in between.
+_READ_S = 0.001
+_STOPPED_S = 1.0  # seconds: work does not delay a tick by so much, so the process was stopped or swapped out
 
 
 def max_silence_s(settings: SessionSettings) -> float:
-    """Return how long a robot may send nothing, in seconds: ping interval and ping timeout together."""
+    """Return the seconds for which a robot may send no message: ping interval plus ping timeout."""
     return settings.ping_interval_s + settings.ping_timeout_s
 
 
 class IdleTimeouts:
-    """The timeouts of all connections of a worker, checked at each tick."""
+    """Closes the idle connections of one worker, at ticks that its dispatcher calls."""
 
     def __init__(self, settings: SessionSettings, now: float) -> None:
         self._hello_s = settings.hello_timeout_s
@@ -38,13 +44,13 @@ class IdleTimeouts:
         self._suspects: set[RobotConnection] = set()
 
     def until_tick_s(self, now: float) -> float:
-        """Return the seconds until the next tick is due; negative if it is late already."""
+        """Return the seconds from *now* until the next tick is due; negative if the tick is late."""
         return self._next_s - now
 
     def close_idle(self, connections: Iterable[RobotConnection], now: float) -> None:
-        """Close the connections that are idle at *now* (s); call this at each tick.
+        """Close the connections that were idle at the last tick and still are at *now* (s): one tick.
 
-        A connection that seems idle is closed at the next tick, after its socket was read once more.
+        Connections without a session (echo), and those that are closing, are left out.
         """
         late_s = now - self._next_s
         suspects: set[RobotConnection] = set()
@@ -52,10 +58,10 @@ class IdleTimeouts:
             if connection.session is None or connection.is_closing:
                 continue
             if late_s >= _STOPPED_S:
-                connection.last_heard_s = min(now, connection.last_heard_s + late_s)
+                connection.last_message_s = min(now, connection.last_message_s + late_s)
                 connection.opened_s = min(now, connection.opened_s + late_s)
             is_opening = connection.is_opening
-            idle_s = now - (connection.opened_s if is_opening else connection.last_heard_s)
+            idle_s = now - (connection.opened_s if is_opening else connection.last_message_s)
             if idle_s < (self._hello_s if is_opening else self._max_silence_s):
                 continue
             if connection not in self._suspects:

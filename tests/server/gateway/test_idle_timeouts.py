@@ -23,7 +23,7 @@ class Connection:
         self.session = SimpleNamespace()
         self.is_opening = is_opening
         self.closed: Any = False
-        self.opened_s = self.last_heard_s = 0.0
+        self.opened_s = self.last_message_s = 0.0
 
     @property
     def is_closing(self) -> bool:
@@ -61,7 +61,7 @@ class PollingLoop:
 
     def read(self) -> None:
         for socket in [each for each in self.unread if not each.closed]:
-            socket.last_heard_s, socket.is_opening = self.now, False
+            socket.last_message_s, socket.is_opening = self.now, False
         self.unread.clear()
 
 
@@ -71,14 +71,14 @@ def closed_at(worker: PollingLoop, socket: Connection, *, late_s: float = 0.0) -
     return worker.now
 
 
-@pytest.mark.parametrize("heard_s", [0.0, 0.01, 0.1, 0.2, 0.24, 0.9])
-def test_a_silent_robot_is_noticed_within_the_limit_whenever_it_fell_silent(heard_s):
+@pytest.mark.parametrize("message_s", [0.0, 0.01, 0.1, 0.2, 0.24, 0.9])
+def test_a_silent_robot_is_noticed_within_the_limit_whenever_it_fell_silent(message_s):
     robot = Connection()
     worker = PollingLoop(robot)
-    worker.run(heard_s)
-    robot.last_heard_s = heard_s
+    worker.run(message_s)
+    robot.last_message_s = message_s
 
-    noticed_s = closed_at(worker, robot) - heard_s
+    noticed_s = closed_at(worker, robot) - message_s
 
     assert LIMIT_S <= noticed_s <= BAR_S
     assert noticed_s <= LIMIT_S + 0.3

@@ -85,7 +85,7 @@ def test_a_token_of_another_robot_does_not_move_the_end(worker: Worker, wrong: s
 
     assert isinstance(wire.sent[-1], Failure)
     assert wire.sent[-1].code == "unauthorized"
-    connection.last_heard_s = worker.loop.now + 1000.0
+    connection.last_message_s = worker.loop.now + 1000.0
     worker.loop.advance(10.01)
     assert wire.closed == (4401, "token-over")
 
@@ -111,7 +111,7 @@ def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(work
 
     assert (wire.closed, other.closed) == ((4409, "replaced"), None)
     worker.told.clear()
-    moving.last_heard_s = worker.loop.now + 1000.0
+    moving.last_message_s = worker.loop.now + 1000.0
     worker.loop.advance(3.0)
     assert worker.told == [{"event": "stays", "robot": RobotId("default", "s"), "number": moving.number}]
     worker.token_watch.replace(moving.number)
