@@ -88,8 +88,8 @@ class RobotConnection:
         self._wire = wire
         self._assembler = FrameAssembler(context.settings.session)
         self._deferred: deque[tuple[bytes, bool]] | None = None
-        """Messages, and whether each is text, that wait until an earlier message is decoded in a
-        thread, or until a command is answered; None if messages are passed to the dispatcher at once."""
+        """Messages, and whether each is text, that wait until an earlier message is decoded in a thread, or
+        until a command is answered; None if messages are passed to the dispatcher at once."""
 
     @property
     def is_closing(self) -> bool:

@@ -239,16 +239,13 @@ class Dispatcher:
         if retry_ms:
             answers.refuse_unread(connection, peek(codec, data), len(data), self.admission.too_fast, retry_ms)
             return True
-        # 2. The overload of the server, or the rest of a pause.  A robot that ignores pauses is not refused:
-        # it
-        #    is read one command at a time.
+        # 2. The overload of the server, or the rest of a pause; a robot that ignores pauses is not refused.
         scheduler = self.stateless.scheduler
         if connection.ignores_pauses or not scheduler.waiting:
             return False
         early_s = max(0.0, connection.paused_until_s - now)
         pause_s = early_s or scheduler.unread_pause_s(connection.robot, connection.allowed_s)
-        # 3. Only commands for the queue of stateless services are refused: the overload is that of this
-        # queue.
+        # 3. Only commands to stateless services are refused, because the overload is that of their queue.
         envelope = peek(codec, data) if pause_s else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False

@@ -1,9 +1,9 @@
 """Accept or reject a WebSocket handshake by path, origin, capacity, token and sub-protocol, in this order.
 
-Every rejection has a fixed body, and the cause of a rejected token goes to the log only.  Only a robot whose
-token was signed with its own enrolled key gets the cause.  The head of the request and the time come in,
-`Accepted` or `Rejected` goes out.  The head is parsed here, too, so that most refusals need no WebSocket
-library.
+Every rejection has a fixed body, and the cause of a rejected token is logged only.  Exception: a robot whose
+token was signed with its own enrolled key gets the cause in the body.  The head of the request and the time
+go in, `Accepted` or `Rejected` comes out.  The head is also parsed here, so that a rejection needs no
+WebSocket library.
 """
 
 from __future__ import annotations
@@ -38,26 +38,30 @@ __all__ = [
 ]  # fmt: skip
 
 HEALTH = "health"
-"""Result of a request for the health page."""
+"""``Rejected.result`` of a request for the health page, which is answered with status 200."""
 
-_RETRY_AFTER_S = 2  # a full server is asked again after this, when robots may have left
+_RETRY_AFTER_S = 2  # seconds after which a robot may try a full server again: robots may have left by then
 _HEALTH_PATH = HEALTH_PATH.encode()
-_NO_KEYS = "no-keys"
+_NO_KEYS = "no-keys"  # why a fresh token is refused by a server that requires no tokens
 _JSON = {"Content-Type": "application/json"}
 _HEAD = re.compile(
     rb"GET ([\x21-\x7e\x80-\xff]+) HTTP/1\.1((?:\r\n[0-9A-Za-z!#$%&'*+.^_`|~-]+:[\t\x20-\x7e\x80-\xff]*)*)"
 )
-"""RFC 9112, without the folded lines that it calls obsolete."""
-_MAX_HEADERS = 128  # far more than robots, browsers and proxies send
-_SINGLE = (b"content-length", b"sec-websocket-key", b"sec-websocket-version")  # must not be repeated
-_WEBSOCKET_KEY = re.compile(rb"[A-Za-z0-9+/]{22}==")
-_VERSIONS = (b"13", b"8", b"7")
+"""The head of a GET request by RFC 9112, without its empty line; obsolete line folding does not match."""
+_MAX_HEADERS = 128  # headers of one request: far more than robots, browsers and proxies send
+_SINGLE = (b"content-length", b"sec-websocket-key", b"sec-websocket-version")  # headers that occur once only
+_WEBSOCKET_KEY = re.compile(rb"[A-Za-z0-9+/]{22}==")  # 16 random bytes in base64: RFC 6455, 4.1
+_VERSIONS = (b"13", b"8", b"7")  # WebSocket versions that are accepted: RFC 6455, and two drafts of it
 _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accepted:
-    """A robot that may upgrade to WebSocket; ``expires_s`` is in Unix seconds, None if it never expires."""
+    """The result of an accepted handshake: the robot, and the codec of its messages.
+
+    ``expires_s`` is the Unix time (s) at which the connection is closed; None if no token is required.
+    ``codec`` is "" for a connection that echoes messages.
+    """
 
     robot: RobotId
     codec: str
@@ -68,7 +72,11 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rejected:
-    """An HTTP answer instead of the upgrade.  ``reason`` is for the log and never sent."""
+    """The HTTP answer to a handshake that is rejected, or to a request for the health page.
+
+    ``result`` is the label under which the metric ``rse_pf_handshakes_total`` counts it.  ``reason`` is
+    logged and never sent.
+    """
 
     status: int
     body: bytes
@@ -76,11 +84,11 @@ class Rejected:
     reason: str = ""
     headers: Mapping[str, str] = field(default_factory=dict)
     answer: bytes = field(default=b"", compare=False, repr=False)
-    """The whole HTTP answer; the connection is closed behind it."""
+    """The bytes of the whole HTTP answer; the connection is closed after them."""
 
 
 class RequestHead:
-    """The head of an HTTP request that was checked line by line; repeated headers are joined by commas."""
+    """The path and headers of a valid HTTP request; values of a repeated header are joined by commas."""
 
     __slots__ = ("_headers", "path", "websocket_key")
 
@@ -88,11 +96,13 @@ class RequestHead:
         self.path = path
         self._headers = headers
         self.websocket_key = self._read_key()
-        """The key of a valid request for an upgrade to WebSocket, empty if this is none."""
+        """The header Sec-WebSocket-Key; empty if the request is no valid upgrade to WebSocket."""
 
     @classmethod
     def parse(cls, data: bytes) -> RequestHead | None:
-        """Return the head in *data*, which lacks its empty line; None unless it is a GET without a body.
+        """Return the request head in *data*; None if it is not valid, no GET, or announces a body.
+
+        *data* does not contain the empty line that ends the head.
 
         Source:
             RFC 9112, 3 and 5; RFC 6455, 4.2.1.
@@ -118,17 +128,17 @@ class RequestHead:
         return cls(request_line[1], headers)
 
     def text(self, name: bytes) -> str:
-        """Return the header *name*, which is given in lower case; "" if it is absent."""
+        """Return the value of the header *name*, given in lower case; "" if there is no such header."""
         value = self._headers.get(name)
         return "" if value is None else value.decode("ascii", "surrogateescape")
 
     def words(self, name: bytes) -> list[str]:
-        """Return the comma-separated entries of the header *name*."""
+        """Return the comma-separated entries of the header *name*; one empty entry if there is no header."""
         text = self.text(name)
         return [word.strip() for word in text.split(",")] if "," in text else [text]
 
     def token(self) -> str:
-        """Return the token of the robot, from a header or a sub-protocol; "" if there is none."""
+        """Return the robot's token from the header Authorization or a sub-protocol; "" if there is none."""
         return carried_token(self.text(b"authorization"), self.words(b"sec-websocket-protocol"))
 
     def _read_key(self) -> bytes:
@@ -145,12 +155,13 @@ class RequestHead:
 
 
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
+    """Return a rejection with a JSON body; *headers* are written with ``_`` for ``-``."""
     body = refusal_body(code, message, hint)
     return _http_answer(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
 
 
 def banned_rejection(seconds: float) -> Rejected:
-    """Return the rejection of a robot that was cut off and is refused for *seconds* more."""
+    """Return the rejection, with status 429, of a robot that is banned for *seconds* more."""
     wait_s = math.ceil(seconds)
     rejected = _rejection(
         429, "quota", f"this robot was cut off, and is refused for another {wait_s} s",
@@ -160,7 +171,10 @@ def banned_rejection(seconds: float) -> Rejected:
 
 
 def _proven_rejection(proven: ProvenRefusal, now_s: float) -> Rejected | None:
-    """Return the rejection of a robot whose signature is valid; None if even it does not get the cause."""
+    """Return the rejection of a token with a valid signature of an enrolled robot, with the cause.
+
+    The body also has the server's clock.  None if the cause is one that not even such a robot gets.
+    """
     members: dict[str, float] = {"server_s": round(now_s, 3)}
     cause = proven.cause
     if cause == "disabled":
@@ -196,7 +210,7 @@ def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, st
 
 
 class HandshakePolicy:
-    """The rules of one worker for handshakes."""
+    """Decides about the handshakes of one worker; ``keys`` verify tokens, None if none are required."""
 
     def __init__(
         self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
@@ -240,9 +254,9 @@ class HandshakePolicy:
 
         Args:
             head: The head of the request.
-            is_full: Whether the worker has its greatest number of robots.
-            anonymous: Name of the robot where no token is required.
-            now_s: Unix time in seconds.
+            is_full: Whether the worker has as many connections as it may, so that this one is rejected.
+            anonymous: Name that the robot gets if no token is required.
+            now_s: Present time, Unix seconds.
         """
         if self._conformance_echo:
             return Accepted(robot=RobotId(DEFAULT_TENANT, anonymous), codec="", subprotocol="")
@@ -264,7 +278,7 @@ class HandshakePolicy:
         return self._no_subprotocol if not codec and isinstance(verdict, Accepted) else verdict
 
     def _with_token(self, token: str, keys: KeySet, now_s: float, *, codec: str) -> Accepted | Rejected:
-        """Accept the robot of *token*, or return the rejection."""
+        """Return the robot of *token* as accepted, or the rejection if the token is not valid at *now_s*."""
         try:
             claims = verify_token(token, keys=keys, now=now_s, settings=self._settings.auth)
         except Unauthorized as error:
@@ -285,7 +299,7 @@ class HandshakePolicy:
         return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
 
     def claims_or_problem(self, token: str, now_s: float) -> Claims | str:
-        """Return the claims of *token*, or the cause of its refusal, which goes to the log only."""
+        """Return the claims of a fresh *token*, or the cause of its refusal, which is for the log only."""
         if self.keys is None:
             return _NO_KEYS
         try:

@@ -1,7 +1,8 @@
-"""Ask some robots of a loaded server to move to another server, spread over time.
+"""Ask some robots of a loaded server to connect to another server, spread over time.
 
-`plan` decides in the supervisor when each worker asks its next robot; `Migration` asks them in the worker.
-At most ``moves_per_s`` robots are asked in a second, and no robot is asked again while it has time to move.
+In the supervisor, `plan` decides when each worker asks its next robot; in the worker, `Migration` chooses the
+robots at random and asks them.  At most ``moves_per_s`` robots are asked in a second, and a robot that was
+asked is not asked again before its time to move is over.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ __all__ = ["Migration", "plan"]
 def plan(
     loads: Sequence[int], robots: int, *, spread_s: float, moves_per_s: float, random: Callable[[], float]
 ) -> list[list[float]]:
-    """Return for each worker the delays in seconds after which it asks one robot each, in order.
+    """Return a list for each worker: the ascending delays, in seconds, after each of which it asks one robot.
 
-    The most loaded worker asks next.  Each request to move comes at a random time within a time slot of its
-    own, so that neither robots nor servers act at the same time.
+    1. The duration is divided into equal time slots, one for each robot.
+    2. In each slot, the worker that has most robots left asks one of them.
+    3. It does so at a random time within the slot, so that neither robots nor servers act at the same time.
 
     Args:
-        loads: Robots of each worker.
-        robots: How many robots are asked; at most all are.
+        loads: Number of robots of each worker.
+        robots: Number of robots to be asked; all are asked if there are fewer.
         spread_s: Duration of the migration in seconds; longer if *moves_per_s* requires it.
-        moves_per_s: Greatest number of robots asked in a second.
-        random: Uniform numbers in ``[0, 1)``.
+        moves_per_s: Greatest number of robots that are asked in a second.
+        random: Returns uniform random numbers in ``[0, 1)``.
     """
     remaining = list(loads)
     delays: list[list[float]] = [[] for _ in loads]
@@ -42,7 +44,7 @@ def plan(
 
 
 class Migration:
-    """The requests to move of one worker."""
+    """Asks robots of one worker to move; ``asked`` counts them since the start."""
 
     def __init__(
         self,
@@ -55,10 +57,10 @@ class Migration:
         """Ask no robot yet.
 
         Args:
-            connections: The live connections of this worker; others add and remove them.
-            loop: Event loop of the worker.
-            now: The worker's monotonic clock, s.
-            choose: Picks one of several connections, at random.
+            connections: The connections of this worker; the dispatcher adds and removes them.
+            loop: The event loop of the worker.
+            now: Returns monotonic seconds.
+            choose: Returns one of several connections, at random.
         """
         self.asked = 0
         self._connections = connections
@@ -67,7 +69,7 @@ class Migration:
         self._choose = choose
 
     def begin(self, delays_s: Iterable[float], within_ms: float) -> None:
-        """Ask one robot after each of *delays_s*; each gets *within_ms* to leave."""
+        """Ask one robot after each of the delays, in seconds; the robot has *within_ms* to move."""
         for delay_s in delays_s:
             self._loop.call_later(delay_s, partial(self._ask, within_ms))
 

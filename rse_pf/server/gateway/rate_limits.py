@@ -1,16 +1,19 @@
 """Limit the messages of each robot, and the handshakes of each address, by token buckets.
 
-A robot has one bucket for all of its sockets of one worker: ``session.max_commands_per_s`` tokens a second,
-and at most `command_burst` tokens.  Each message takes one.  A message that finds the bucket empty is refused
-with the time until the next token.  A robot that keeps sending is disconnected and banned:
+The rule for the messages of a robot, all of its sockets of one worker together:
 
-1. `command_burst` refusals are one violation.
-2. `_MAX_VIOLATIONS` violations within `_VIOLATIONS_WINDOW_S` end the connection with close code 4429.
-3. Handshakes of that robot are refused for `RATE_BAN_S`.
+1. Its bucket gains ``session.max_commands_per_s`` tokens a second, and holds at most `command_burst` tokens:
+   those of two seconds.
+2. A message takes one token.  Without a token it is refused, with the time until the next token.
+3. `command_burst` refusals are one violation.
+4. `_MAX_VIOLATIONS` violations within `_VIOLATIONS_WINDOW_S` close the connection with the code 4429.
+5. After that, handshakes of the robot are refused for `RATE_BAN_S`.
 
-A robot that keeps to its rate is never refused, and one a little above it gets refusals only.  An address has
-a bucket for its handshakes.  Times and names go in, decisions come out, and memory is bounded whatever
-unauthenticated clients send.
+A robot that keeps to its rate is never refused, and a robot a little above its rate is refused but never
+disconnected.  A handshake takes a token from the bucket of its address, which gains
+``serving.max_handshakes_per_source_per_s`` tokens a second and holds at most `HANDSHAKE_BURST`; without a
+token it is refused.  The number of robots and addresses in memory is bounded.  Times go in, decisions come
+out.
 
 Source:
     Turner 1986, "New directions in communications" (token bucket).
@@ -33,14 +36,14 @@ from rse_pf.wire.rate_limit import command_burst
 __all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RATE_BAN_S", "RobotRates", "SourceRates"]
 
 CUT_OFF = math.inf
-"""Returned instead of a time to wait: the robot ignores refusals, so its connection is to be closed."""
+"""Result of `RobotRates.retry_after_ms` for a robot that ignores refusals: close its connection."""
 
-RATE_BAN_S = 5.0  # handshakes of a disconnected robot are refused: otherwise it would resume at once
-HANDSHAKE_BURST = 1000.0  # sockets or handshakes accepted at once above the rate: a fleet that reconnects
-_MAX_NAMES = 20000  # robots or addresses remembered; those whose buckets are full are forgotten first
-_MIN_RETRY_MS = 1.0  # shortest pause that a refused robot is given; 0 would accept its message
-_MAX_VIOLATIONS = 3  # one violation may be a burst that was sent before its first refusal arrived
-_VIOLATIONS_WINDOW_S = 10.0  # violations that lie further apart do not count together
+RATE_BAN_S = 5.0  # seconds for which a robot that was disconnected for its rate cannot connect again
+HANDSHAKE_BURST = 1000.0  # sockets, or handshakes of one address, accepted at once: a fleet that reconnects
+_MAX_NAMES = 20000  # robots, or addresses, in memory at most; those with full buckets are forgotten first
+_MIN_RETRY_MS = 1.0  # shortest pause of a refused robot in milliseconds: 0 would mean that it was accepted
+_MAX_VIOLATIONS = 3  # violations that close a connection: one may be a burst sent before the first refusal
+_VIOLATIONS_WINDOW_S = 10.0  # seconds after which a violation is forgotten
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -48,6 +51,8 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Robot:
+    """The state of one robot; ``refused`` counts refusals since the last violation."""
+
     bucket: TokenBucket
     refused: int = 0
     violations: deque[float] = field(default_factory=deque)
@@ -58,21 +63,21 @@ class RobotRates:
     """The token buckets, violations and bans of the robots of one worker."""
 
     def __init__(self, limits: SessionSettings, *, max_names: int = _MAX_NAMES) -> None:
-        """Remember no robot yet, and never more than *max_names*."""
+        """Know no robot yet; the state of at most *max_names* robots is kept in memory."""
         self._limits = limits
         self._max_names = max_names
         self._robots: dict[RobotId, _Robot] = {}
 
     def __len__(self) -> int:
-        """Return how many robots are remembered."""
+        """Return the number of robots whose state is in memory."""
         return len(self._robots)
 
     def retry_after_ms(self, robot: RobotId, now: float) -> float:
-        """Take one token for a message of *robot* at *now* (s).
+        """Take one token for a message of *robot* that arrived at *now* (monotonic s).
 
         Returns:
-            0 if the message is accepted, else the milliseconds until the next token, or `CUT_OFF` if the
-            connection is to be closed.
+            0 if the message is accepted, or if there is no limit.  Otherwise the milliseconds until the next
+            token, or `CUT_OFF` if the robot is banned from now on and its connection must be closed.
         """
         if self._limits.max_commands_per_s <= 0:
             return 0.0
@@ -87,16 +92,17 @@ class RobotRates:
         return max(_MIN_RETRY_MS, wait_s * 1e3)
 
     def ban(self, robot: RobotId, now: float, seconds: float | None = None) -> None:
-        """Refuse the handshakes of *robot* from *now* (s) for *seconds*, or for `RATE_BAN_S`."""
+        """Refuse the handshakes of *robot* from *now* (s) for *seconds*; None means `RATE_BAN_S`."""
         known = self._robots.get(robot) or self._add(robot, now)
         known.banned_until = now + (RATE_BAN_S if seconds is None else seconds)
 
     def banned_s(self, robot: RobotId, now: float) -> float:
-        """Return how many seconds of the ban of *robot* are left, 0 without a ban."""
+        """Return the seconds from *now* until the ban of *robot* ends; 0 if it is not banned."""
         known = self._robots.get(robot)
         return 0.0 if known is None else max(0.0, known.banned_until - now)
 
     def _violations(self, known: _Robot, now: float) -> int:
+        """Count one refusal, and return the number of violations within the window."""
         known.refused += 1
         if known.refused >= command_burst(self._limits.max_commands_per_s):
             known.refused = 0
@@ -120,20 +126,23 @@ class RobotRates:
 
 
 class SourceRates:
-    """The token buckets of the addresses that send handshakes; checked before any token is read."""
+    """The token buckets of the addresses that send handshakes; checked before a robot's token is verified."""
 
     def __init__(self, serving: ServingSettings, *, max_names: int = _MAX_NAMES) -> None:
-        """Remember no address yet, and never more than *max_names*."""
+        """Know no address yet; the buckets of at most *max_names* addresses are kept in memory."""
         self._serving = serving
         self._max_names = max_names
         self._sources: dict[str, TokenBucket] = {}
 
     def __len__(self) -> int:
-        """Return how many addresses are remembered."""
+        """Return the number of addresses whose buckets are in memory."""
         return len(self._sources)
 
     def wait_s(self, source: str, now: float) -> float:
-        """Return 0 if *source* may shake hands at *now* (s), else the seconds until it may."""
+        """Take one token of the address *source* for a handshake at *now* (s).
+
+        Return 0 if the handshake is accepted, else the seconds until the next token.
+        """
         rate = self._serving.max_handshakes_per_source_per_s
         if rate <= 0:
             return 0.0
@@ -148,10 +157,13 @@ class SourceRates:
         return bucket.take(now)
 
     def source(self, peer: str, forwarded_for: str) -> str:
-        """Return the address that a handshake came from, see `source_address`."""
+        """Return the address that a handshake came from: *peer*, or an entry of the header X-Forwarded-For.
+
+        Which of them depends on ``serving.trusted_proxies``, see `source_address`.
+        """
         return source_address(peer, forwarded_for, self._serving.trusted_proxies)
 
 
 def _half(names: dict[Key, Value], max_names: int) -> dict[Key, Value]:
-    """Return the newer names, at most half of *max_names*, so that forgetting stays rare."""
+    """Return the newest entries, at most half of *max_names*, so that this is rarely called."""
     return dict(list(names.items())[-max_names // 2 :])

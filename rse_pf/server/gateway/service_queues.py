@@ -1,7 +1,8 @@
-"""The queues of the services that a worker computes itself: stateless services, and limited ones.
+"""The two queues of the services that a worker computes itself: stateless services, and limited services.
 
-Both have the order of a `Scheduler`, and threads for the computation; everything else runs in the event loop.
-Limited services have a queue of their own, so that no pose waits for a map.
+In each queue a `Scheduler` decides the order, and threads compute the commands; all else runs in the event
+loop.  Limited services, such as those that read maps, have a queue of their own, so that no pose waits for a
+map.
 """
 
 from __future__ import annotations
@@ -29,18 +30,19 @@ from rse_pf.service import Service
 
 __all__ = ["LimitedQueue", "StatelessQueue", "ThreadQueue"]
 
-_SOLVER_THREADS = 1  # of each worker: a second one would wait for the interpreter lock
-# Time for commands in one round of the event loop.  With longer rounds sockets are read too rarely, and
-# commands wait in the kernel, where the scheduler cannot count them.
+_SOLVER_THREADS = 1  # of a worker, for stateless services: a second one would wait for the interpreter lock
+# Seconds of one round of the event loop after which it computes no further command.  With longer rounds
+# sockets are read too rarely, and commands wait in the kernel, where the scheduler cannot count them.
 _INLINE_S = 0.001
-# Share of the time since the last round that commands may take where commands wait and no socket is unread.
+# If commands wait, and all readable sockets were read, the limit is instead this share of the time since the
+# last round ended, at least `_INLINE_S` and at most `_MAX_INLINE_S`.
 _INLINE_SHARE = 0.5
-_MAX_INLINE_S = 0.005  # bound of that share, so that timers and control messages wait no longer
-_MIN_INLINE_S = 1e-6  # counted for a command that took no time by the clock, so that the round counts as used
+_MAX_INLINE_S = 0.005  # greatest limit in seconds, so that timers and control messages are not delayed more
+_MIN_INLINE_S = 1e-6  # seconds that count for a command which took 0 s by the clock: a used round is not at 0
 
 
 class ThreadQueue(CommandQueue):
-    """Commands of some services that wait, or run in threads."""
+    """A queue whose commands run in threads; the base of the two queues of this module."""
 
     def __init__(
         self, context: WorkerContext, answers: Answers, services: Iterable[Service], *, threads: int
@@ -51,7 +53,7 @@ class ThreadQueue(CommandQueue):
             context: The clocks and the event loop of the worker.
             answers: Computes, encodes and sends answers.
             services: The services that this queue offers.
-            threads: Commands that run at the same time.
+            threads: Number of threads, and so of commands that run at the same time.
         """
         self.scheduler = Scheduler(max_running=threads)
         self._names = frozenset(service.name for service in services)
@@ -64,27 +66,30 @@ class ThreadQueue(CommandQueue):
 
     @property
     def held(self) -> int:
-        """Commands that wait or run."""
+        """Number of commands that wait or run."""
         return self.scheduler.waiting + self.scheduler.running
 
     def offers(self, service: str) -> bool:
-        """Return whether *service* is one of this queue."""
+        """Return whether this queue takes commands to *service*."""
         return service in self._names
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return what would delay *queued*, see `Scheduler.backlog`."""
+        """Return the load that decides whether *queued* is admitted, see `Scheduler.backlog`."""
         return self.scheduler.backlog(queued)
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Queue *queued*, which was admitted at *now* (s), and start the commands that may run."""
+        """Queue *queued*, which was admitted at *now* (s), and start as many commands as may run.
+
+        A frame of the same stream that it replaces is answered as stale.
+        """
         self._refuse(self.scheduler.submit(queued), now)
         self._start()
 
     def withdraw(self, owner: object, command_id: int) -> None:
-        """Do nothing: the command is answered before its deadline."""
+        """Ignore that the robot cancelled a command: it is computed, and answered as usual."""
 
     def leave(self, owner: object) -> list[QueuedCommand]:
-        """Drop the waiting commands of a connection that ended, and return them; what runs continues."""
+        """Drop the waiting commands of a closed connection, and return them; a running one continues."""
         return self.scheduler.leave(owner)
 
     def close(self) -> None:
@@ -97,12 +102,15 @@ class ThreadQueue(CommandQueue):
         raise NotImplementedError
 
     def _start(self) -> None:
-        """Start the commands that may run."""
+        """Start as many waiting commands as may run now."""
         while (queued := self._next(self._monotonic())) is not None:
             self._run(queued)
 
     def _next(self, now: float) -> QueuedCommand | None:
-        """Return the next command, which runs from now on; refuse those before it that waited too long."""
+        """Return the next command, which counts as running at *now* (s); None if none may run.
+
+        Commands before it whose deadline has passed, or that have waited for too long, are refused.
+        """
         queued, refusals = self.scheduler.start(now)
         if refusals:
             self._refuse(refusals, now)
@@ -137,7 +145,7 @@ class ThreadQueue(CommandQueue):
 
 
 class LimitedQueue(ThreadQueue):
-    """Commands of limited services; a thread waits for the process with limits."""
+    """The queue of limited services: a thread passes each command to a limited process and waits for it."""
 
     def __init__(self, context: WorkerContext, answers: Answers, limited: LimitedServices) -> None:
         """Compute nothing yet; *limited* computes the commands in its processes."""
@@ -159,7 +167,7 @@ class LimitedQueue(ThreadQueue):
         return self._answers.encode(queued, self._limited.compute(queued), started_s)
 
     def report(self) -> QueueReport:
-        """Return gauges for /metrics."""
+        """Return the gauges ``compute_*`` of limited services for /metrics."""
         return QueueReport(
             gauges={
                 "compute_queue": float(self.scheduler.waiting),
@@ -170,17 +178,20 @@ class LimitedQueue(ThreadQueue):
         )
 
     def close(self) -> None:
-        """Let the threads exit, and end the processes at once."""
+        """Let the threads exit, and kill the limited processes at once."""
         super().close()
         self._limited.close()
 
 
 class StatelessQueue(ThreadQueue):
-    """Commands of stateless services; cheap ones are computed in the event loop where that saves time.
+    """The queue of stateless services; the event loop computes cheap commands where that saves time.
 
-    A cheap command of an idle server is computed at once (`runs_at_once`).  All others wait in the order of
-    the `Scheduler`, and cheap ones among them are computed in the event loop as long as a thread would save
-    no time.
+    1. If no command waits or runs, a cheap command is computed in the event loop at once (`runs_at_once`).
+    2. Otherwise a command is queued, and the `Scheduler` decides the order.
+    3. A queued command is computed in the event loop if its service is cheap and a thread would save no time
+       (`Scheduler.runs_inline`), or else in the solver thread.
+    4. In one round of the event loop, commands are computed for a bounded time (`_INLINE_S`,
+       `_INLINE_SHARE`).
     """
 
     def __init__(self, context: WorkerContext, answers: Answers) -> None:
@@ -194,22 +205,22 @@ class StatelessQueue(ThreadQueue):
         self._cheap = frozenset(
             service.name for service in services if service.cheap and service.name not in answers.with_objects
         )
-        """Services that `runs_at_once` may run: in the event loop, without asking a store before."""
+        """Names of the services that `runs_at_once` may call: they are cheap, and read no stored objects."""
         self._throttle = CpuThrottle(
             context.settings.serving.emulated_cores, now=clocks.monotonic(), cpu=clocks.cpu
         )
         self._throttle_timer: TimerHandle | None = None
         self._waits = LongestRecently()
         self._inline_s = 0.0
-        """Time that commands took in this round of the event loop."""
+        """Seconds that commands have taken in this round of the event loop."""
         self._max_inline_s = _INLINE_S
         self._round_ended_s = 0.0
         self.leaves_unread: Callable[[], bool] = lambda: False
-        """Returns whether there was no time for some of the sockets when they were read last."""
+        """Returns whether the event loop left readable sockets unread in its last round."""
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Queue *queued*, which was admitted at *now* (s), and start the commands that may run."""
-        self._crash.compute_for(0)  # commands of other robots may start, too; `Answers.compute` marks each
+        """Queue *queued*, which was admitted at *now* (s), and start as many commands as may run."""
+        self._crash.compute_for(0)  # commands of other robots may start, too: `Answers.compute` marks them
         super().submit(queued, now)
 
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
@@ -217,7 +228,7 @@ class StatelessQueue(ThreadQueue):
         return self._answers.compute(queued)
 
     def report(self) -> QueueReport:
-        """Return gauges for /metrics."""
+        """Return the gauges of stateless services for /metrics: waiting and running commands, and waits."""
         now = self._monotonic()
         oldest_wait_s = self.scheduler.oldest_wait_s(now)
         return QueueReport(
@@ -230,10 +241,11 @@ class StatelessQueue(ThreadQueue):
         )
 
     def runs_at_once(self, queued: QueuedCommand) -> bool:
-        """Answer a cheap command of an idle server without queueing it; False if it has to be queued or
-        refused.
+        """Compute and answer *queued* in the event loop without queueing it, and return True.
 
-        This decides, counts and answers as `submit` does.
+        Return False and do nothing if *queued* is not cheap, small and within the scope of its token, if
+        other commands wait or run, if this round of the event loop has no time left, or if the CPU is
+        throttled.  The caller then admits and queues the command as usual.
         """
         service = queued.command.service
         claims = queued.owner.claims
@@ -256,13 +268,13 @@ class StatelessQueue(ThreadQueue):
         return True
 
     def _note_inline(self, spent_s: float) -> None:
-        """Note that a command took *spent_s* of this round of the event loop."""
+        """Add *spent_s* to the time that commands have taken in this round of the event loop."""
         if not self._inline_s:
             self._loop.call_soon(self._begin_round)
         self._inline_s += spent_s or _MIN_INLINE_S
 
     def _start(self) -> None:
-        """Start the commands that may run, as long as this round of the event loop and the throttle allow."""
+        """Start waiting commands until none may run, this round's time is used, or the CPU is throttled."""
         while self._inline_s < self._max_inline_s and self.scheduler.waiting:
             now = self._monotonic()
             wait_s = self._throttle.wait_s(now)
@@ -277,7 +289,7 @@ class StatelessQueue(ThreadQueue):
             self._run(queued)
 
     def _run(self, queued: QueuedCommand) -> None:
-        """Compute the answer to *queued*, in the event loop or in a solver thread."""
+        """Compute the answer to *queued* in the event loop, if that saves time, else in a solver thread."""
         command, answers = queued.command, self._answers
         service = answers.registry.get(command.service)
         asks_store = command.service in answers.with_objects and answers.objects.has_references(
@@ -291,7 +303,7 @@ class StatelessQueue(ThreadQueue):
             super()._run(queued)
 
     def _begin_round(self) -> None:
-        """Begin a round of the event loop; if no socket was left unread, commands may take more of it."""
+        """Begin a round of the event loop: set the limit of its time for commands, and start commands."""
         self._inline_s, self._max_inline_s = 0.0, _INLINE_S
         if self.scheduler.waiting:
             if not self.leaves_unread():

@@ -1,6 +1,6 @@
-"""Close the connections of a worker whose token expires, is revoked, or is used by a newer connection.
+"""Close the connections of a worker whose token expires or is revoked, or whose robot has a newer connection.
 
-A robot gets no reason beyond the close code.
+A robot gets only the close code, and no further reason.  A fresh token on an open connection renews it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["TokenWatch"]
 
 
 class TokenWatch:
-    """The tokens of the connections of one worker; the dispatcher calls `watch` and `forget`."""
+    """Watches the tokens of all connections of one worker; the dispatcher calls `watch` and `forget`."""
 
     def __init__(
         self,
@@ -36,9 +36,9 @@ class TokenWatch:
         Args:
             context: The clocks, event loop, log and metrics of the worker.
             connections: The live connections of this worker; the dispatcher adds and removes them.
-            handshake: Verifies fresh tokens, and gets new keys.
-            send: Sends an event to the supervisor.
-            recorder: Records fresh tokens, and connections that are closed, for the audit log.
+            handshake: Verifies fresh tokens; `trust` replaces its keys.
+            send: Sends its keyword arguments as an event of a robot to the supervisor.
+            recorder: Records fresh tokens, and connections closed for revoked tokens, for the audit log.
         """
         self.connections = connections
         self._handshake = handshake
@@ -66,32 +66,33 @@ class TokenWatch:
                 connection.claims = renewed_claims(claims, keys)
 
     def watch(self, connection: RobotConnection, expires_s: float | None) -> None:
-        """Watch a connection whose handshake is done; its token ends at *expires_s* (monotonic clock, s)."""
+        """Watch a new connection, and close it at *expires_s* (monotonic s); None sets no such time."""
         claims, keys = connection.claims, self._handshake.keys
         if claims is not None:
             self._by_number[connection.number] = connection
             problem = "" if keys is None else claims_problem(claims, keys)
-            if problem:  # new keys came between the handshake and now
+            if problem:  # the keys changed between the handshake and this call
                 self._context.loop.call_soon(self._revoke, connection, claims, problem)
             elif keys is not None:
                 connection.claims = renewed_claims(claims, keys)
         self._end_at(connection, expires_s)
 
     def report_hello(self, connection: RobotConnection) -> None:
-        """Report to the supervisor that a robot said Hello, so that its older connections end."""
+        """Report to the supervisor that a robot sent its Hello, so that its older connections are closed."""
         self._report("arrived", connection)
 
     def forget(self, connection: RobotConnection) -> None:
-        """Forget a connection."""
+        """Forget a closed connection, and report to the supervisor that its robot has left."""
         self._end_at(connection, None)
         _cancel(self._stays, connection)
         if self._by_number.pop(connection.number, None) is not None:
             self._report("left", connection)
 
     def replace(self, number: int) -> None:
-        """Close the connection *number*, because its robot has a newer one.
+        """Close the connection *number*, because its robot has a newer connection to this server.
 
-        A connection that was asked to move is closed when its time to move is over.
+        If the robot was asked to move, its time to move is awaited first: then the supervisor gets the event
+        ``stays``, and calls this again.
         """
         connection = self._by_number.get(number)
         if connection is None or connection.is_closing:
@@ -104,7 +105,11 @@ class TokenWatch:
         connection.close(CLOSE_REPLACED, "replaced")
 
     def renew(self, connection: RobotConnection, token: str) -> None:
-        """Verify a fresh token of a live connection, which then lasts until that token expires."""
+        """Verify a fresh *token* of an open connection, and answer the robot.
+
+        A valid token of the same robot sets the claims and the expiry of the connection; otherwise both stay
+        as they are.
+        """
         before, clocks = connection.claims, self._context.clocks
         now, wall_s = clocks.monotonic(), clocks.wall()
         claims = self._handshake.claims_or_problem(token, wall_s)
@@ -123,13 +128,14 @@ class TokenWatch:
         connection.answer_renewal(token_s)
 
     def _end_at(self, connection: RobotConnection, expires_s: float | None) -> None:
+        """Set the timer that closes *connection* at *expires_s* (monotonic s); None only removes it."""
         _cancel(self._timers, connection)
         if expires_s is not None:
             left_s = max(0.0, expires_s - self._context.clocks.monotonic())
             self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
 
     def _stay(self, connection: RobotConnection, left_s: float) -> None:
-        """Report to the supervisor after *left_s* that a connection which was asked to move has not left."""
+        """Report to the supervisor after *left_s* seconds that *connection*, asked to move, is still open."""
         _cancel(self._stays, connection)
         self._stays[connection] = self._context.loop.call_later(
             left_s, partial(self._report, "stays", connection)

@@ -1,12 +1,12 @@
 """The sockets of robots in one worker: handshakes, then WebSocket connections by picows on uvloop.
 
 1. `RobotSockets` reads the head of the request from each socket that the supervisor passed to this worker,
-   and answers the handshake, in small time slices.
-2. An accepted socket gets a `RobotProtocol`, which passes bytes to picows, and a `Listener`, which passes
-   frames to a `RobotConnection` and writes for it.
+   and answers the handshake, in small time slices (`DeferredWork`).
+2. A socket whose handshake is accepted gets a `RobotProtocol`, which passes bytes to picows, and a
+   `Listener`, which passes frames to a `RobotConnection` and writes for it.
 
-Only this file uses picows.  The text of an exception never reaches a robot, a robot that reads too slowly is
-disconnected, and nothing behind the first CLOSE frame is read.
+Only this file uses picows.  The text of an exception is never sent to a robot, a robot that reads too slowly
+is disconnected, and nothing behind the first CLOSE frame is read.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-# Its function connect_accepted_socket costs a task and two futures for each socket.
+# The transport is made directly: aiofastnet's connect_accepted_socket costs a task and two futures a socket.
 from aiofastnet.selector_transport import SelectorSocketTransport
 from picows import picows as _picows
 
@@ -41,29 +41,31 @@ from rse_pf.server.gateway.rate_limits import SourceRates
 from rse_pf.server.scheduling.deferred_work import DeferredWork
 from rse_pf.server.scheduling.socket_poller import SocketPoller
 
-picows: Any = _picows  # its stubs lack what is used here
+picows: Any = _picows  # the type stubs of picows lack some names that are used here
 
 __all__ = ["PendingSocket", "RobotSockets"]
 
-_MAX_CLOSE_REASON_BYTES = 123  # RFC 6455, 5.5: a control frame has at most 125 bytes, two of them the code
+_MAX_CLOSE_REASON_BYTES = 123  # RFC 6455, 5.5: a control frame has at most 125 bytes, two for the close code
 _UPGRADE = (
     b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: %b\r\n\r\n"
 )
-"""The request that picows gets in place of the robot's own, since it keeps it as long as the connection."""
-_SWITCHING = 101
+"""The request that picows gets instead of the robot's request: picows keeps it in memory until the end."""
+_SWITCHING = 101  # HTTP status of an accepted upgrade
 _NO_HEADERS: dict[str, str] = {}
-_MAX_READ_BYTES = 16384  # read from one socket before the next: that is up to 2,700 of the smallest frames
-_HANDSHAKES_S = 0.0005  # for handshakes in one round of the event loop, so that commands hardly wait for them
-_MAX_WAITING = 8  # new sockets that wait for their first read; others wait in the supervisor's channel
-_LINGER_S = 2.0  # for a robot to read the CLOSE frame and to close its side, before the socket is closed
-_READ_BUFFER_BYTES = 2048  # first read buffer of a socket: small for idle robots; it grows with messages
+_MAX_READ_BYTES = 16384  # bytes read from one socket before the next one: up to 2,700 of the smallest frames
+_HANDSHAKES_S = 0.0005  # seconds for handshakes in one round of the event loop: commands hardly wait for them
+# Steps of handshakes that wait; while there are so many, new sockets stay in the supervisor's channel.
+_MAX_WAITING = 8
+# Seconds in which a robot can read the CLOSE frame and close its side, before the socket is closed.
+_LINGER_S = 2.0
+_READ_BUFFER_BYTES = 2048  # first size of a socket's read buffer: small for idle robots; it grows as needed
 _TEXT = int(picows.WSMsgType.TEXT)
 _BINARY = int(picows.WSMsgType.BINARY)
 
 
 class _NoLogger:
-    """The logger that picows gets, so that it does not make one for each socket."""
+    """A logger that ignores everything, shared by all sockets: picows would make one for each socket."""
 
     def isEnabledFor(self, level: int) -> bool:
         return False
@@ -77,9 +79,12 @@ _NO_LOGGER = _NoLogger()
 
 
 class _RobotSocket(socket.socket):
-    """An accepted socket without the system calls that libraries make only for their log lines."""
+    """An accepted socket without system calls for its options and addresses.
 
-    family = socket.AF_INET  # IPv6 has the same options
+    Libraries request these values for their log lines only, so that constants are returned.
+    """
+
+    family = socket.AF_INET  # also for IPv6: the options that are set are the same
     type = socket.SOCK_STREAM
 
     def getsockopt(self, *_: int) -> int:  # type: ignore[override]
@@ -92,14 +97,16 @@ class _RobotSocket(socket.socket):
 
 
 class PendingSocket:
-    """An accepted socket until its handshake is answered.
+    """A socket that the supervisor accepted, until its handshake is answered.
 
     Attributes:
+        accepted: The socket.
         peer: Address of the other end of the TCP connection.
         number: Number of the socket on this server, in the order of acceptance.
-        on_end: Called once, at the end of the socket.
-        seen: The bytes of its request that have arrived.
-        timeout: The timer that closes it; None before the first read, and after the whole request was read.
+        on_end: Called once, when the socket is closed.
+        seen: The bytes of the request that have arrived.
+        timeout: The timer that closes the socket; None before the first read, and after the whole request was
+            read.
     """
 
     __slots__ = ("accepted", "number", "on_end", "peer", "seen", "timeout")
@@ -115,9 +122,9 @@ class PendingSocket:
         self.timeout: asyncio.TimerHandle | None = None
 
     def close(self, answer: bytes = b"") -> None:
-        """Send *answer*, if there is one, and close the socket."""
+        """Send *answer* unless it is empty, and close the socket."""
         if answer:
-            # An answer is far shorter than what the kernel buffers; a robot that has disconnected gets none.
+            # The kernel takes a whole answer at once, since its buffer is far larger.
             with contextlib.suppress(OSError):
                 self.accepted.send(answer)
         self.accepted.close()
@@ -125,7 +132,7 @@ class PendingSocket:
 
 
 class _Upgrade:
-    """The answer that picows sends to an accepted handshake, without the cost of its own class."""
+    """The HTTP answer that picows sends to an accepted handshake; cheaper than the class of picows."""
 
     __slots__ = ("_subprotocol", "headers")
     status = _SWITCHING
@@ -135,7 +142,7 @@ class _Upgrade:
         self.headers: dict[str, str] = {}
 
     def to_bytes(self) -> bytearray:
-        """Return the answer; picows has added the header ``Sec-WebSocket-Accept``."""
+        """Return the bytes of the answer, with the header ``Sec-WebSocket-Accept`` that picows has added."""
         chosen = f"Sec-WebSocket-Protocol: {self._subprotocol}\r\n" if self._subprotocol else ""
         accept = self.headers["Sec-WebSocket-Accept"]
         self.headers = _NO_HEADERS  # picows keeps this object as long as the connection
@@ -146,7 +153,7 @@ class _Upgrade:
 
 
 class RobotSockets:
-    """Takes accepted sockets, and connects each robot whose handshake is accepted to the dispatcher."""
+    """Answers the handshakes of one worker, and connects the accepted robots to its dispatcher."""
 
     def __init__(
         self,
@@ -177,15 +184,15 @@ class RobotSockets:
 
     @property
     def is_behind(self) -> bool:
-        """Whether no further socket should be taken in this round, because `_MAX_WAITING` handshakes wait."""
+        """Whether no further socket should be taken now, because `_MAX_WAITING` steps of handshakes wait."""
         return len(self._steps) >= _MAX_WAITING
 
     def take(self, fd: int, on_end: Callable[[], None], number: int, peer: str) -> None:
-        """Serve the accepted socket *fd*.
+        """Read the handshake of an accepted socket, and serve its robot if the handshake is accepted.
 
         Args:
-            fd: The descriptor, which belongs to this object from now on.
-            on_end: Called once, at the end of the socket.
+            fd: The descriptor of the socket, which this object closes.
+            on_end: Called once, when the socket is closed.
             number: Number of the socket on this server, in the order of acceptance.
             peer: Address of the other end of the TCP connection.
         """
@@ -195,6 +202,10 @@ class RobotSockets:
         self._steps.add(self._read_first, PendingSocket(accepted, peer, on_end, number))
 
     def _read_first(self, pending: PendingSocket) -> None:
+        """Read a new socket; if its request is not whole yet, wait for the rest until the Hello timeout.
+
+        Of too many sockets that wait, the one that has waited longest is closed.
+        """
         if self._read(pending):
             return
         loop, session = self._context.loop, self._context.settings.session
@@ -206,12 +217,12 @@ class RobotSockets:
             self._cut(surplus)
 
     def _cut_late(self, pending: PendingSocket) -> None:
-        """Close a socket whose time is over, unless its request has arrived meanwhile."""
+        """Close a socket whose Hello timeout is over, unless its whole request was read meanwhile."""
         if pending.timeout is not None:
             self._cut(pending)
 
     def _cut(self, pending: PendingSocket) -> None:
-        """Close a socket without an answer."""
+        """Stop waiting for the request of a socket, and close the socket without an answer."""
         self._forget(pending)
         pending.close()
 
@@ -223,7 +234,8 @@ class RobotSockets:
             self._pending.leave(pending)
 
     def _on_readable(self, pending: PendingSocket) -> None:
-        # A thousand sockets may be readable, or ended, in the same round of the event loop.
+        # Reading is a deferred step, because a thousand sockets may be readable in one round of the event
+        # loop.
         self._context.loop.remove_reader(pending.accepted.fileno())
         self._steps.add(self._read_on, pending)
 
@@ -233,10 +245,14 @@ class RobotSockets:
             self._context.loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)
 
     def _read(self, pending: PendingSocket) -> bool:
-        """Read what has arrived of the request; return whether the socket was answered or closed."""
+        """Read the bytes of the request that have arrived, and answer the handshake if the request is whole.
+
+        Return True if the socket was answered or closed, False if more of the request must arrive.
+        """
         max_bytes = MAX_HANDSHAKE_BYTES
         try:
-            # Closing with unread bytes would reset the connection, and its answer would be lost.
+            # More than the head is read, because closing with unread bytes would reset the connection, and
+            # the answer would be lost.
             data = pending.accepted.recv(_MAX_READ_BYTES)
         except BlockingIOError:
             return False
@@ -256,7 +272,10 @@ class RobotSockets:
         return True
 
     def _answer_handshake(self, pending: PendingSocket, head: RequestHead | None, rest: bytes) -> None:
-        """Answer a handshake; *rest* was read behind its head.  A defect is logged and answered with 500."""
+        """Answer the handshake with the request *head*; None rejects it, as no valid request.
+
+        *rest* are bytes that were read behind the head.  An exception is logged and answered with status 500.
+        """
         if head is None:
             self._refuse(pending, self._handshake.no_request, pending.peer, "")
             return
@@ -266,7 +285,7 @@ class RobotSockets:
             token = head.token()
             verdict = self._verdict(head, source)
             self._recorder.record_verdict(verdict, source, token, self._handshake.keys)
-        except Exception as error:  # noqa: BLE001  other robots are served on
+        except Exception as error:  # noqa: BLE001  a defect must not stop the worker for other robots
             self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
         if isinstance(verdict, Accepted):
@@ -283,10 +302,12 @@ class RobotSockets:
         pending.close(verdict.answer)
 
     def _serve(self, pending: PendingSocket, verdict: Accepted, upgrade: bytes, rest: bytes) -> None:
+        """Give the socket of an accepted handshake to picows, with the request *upgrade* and then *rest*."""
         listener = Listener(self._dispatcher, verdict, pending.number)
         accepted = pending.accepted
         try:
-            # By default the kernel buffers megabytes for a slow reader, which this process would not notice.
+            # By default the kernel buffers megabytes, so that this process would notice a slow robot too
+            # late.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
             protocol = RobotProtocol(
                 listener, verdict.subprotocol, upgrade, rest,
@@ -298,6 +319,7 @@ class RobotSockets:
             pending.close()
 
     def _verdict(self, head: RequestHead, source: str) -> Accepted | Rejected:
+        """Return the result of the handshake: by the address's rate, `HandshakePolicy`, and robots' bans."""
         now = self._context.clocks.monotonic()
         if self._sources.wait_s(source, now) > 0:
             return replace(self._handshake.too_fast, reason="address-rate")
@@ -317,7 +339,7 @@ class RobotSockets:
 
 
 class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
-    """The bytes of one robot's socket; passes nothing behind the first CLOSE frame to picows.
+    """Passes the bytes of one robot's socket to picows, up to the end of the first CLOSE frame.
 
     picows sends no pings and answers none: `RobotConnection` answers them.
     """
@@ -336,12 +358,12 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
         """Wait for the transport.
 
         Args:
-            listener: Gets the frames.
-            subprotocol: What was agreed in the handshake.
-            upgrade: The request that picows gets in place of the robot's.
+            listener: The `Listener`, which gets the frames.
+            subprotocol: The sub-protocol that was agreed in the handshake; "" for none.
+            upgrade: The request that picows gets instead of the robot's request.
             rest: Bytes that were read behind the robot's request.
-            max_frame_bytes: A longer frame ends the connection.
-            poller: Reads the rest of a message that is longer than one read, after other sockets.
+            max_frame_bytes: A frame with a longer payload closes the connection.
+            poller: Reads the sockets of robots; after `_MAX_READ_BYTES` of one socket it reads others first.
             on_end: Called when the socket is closed.
         """
         answer = picows.WSUpgradeResponseWithListener(_Upgrade(subprotocol), listener)
@@ -387,7 +409,7 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
         if size:
             super().buffer_updated(size)
         if read_bytes >= _MAX_READ_BYTES and self._is_made:
-            # The transport would read on up to 256 KiB before the next socket.
+            # Without this, the transport would read up to 256 KiB before the next socket is read.
             read_bytes = 0
             self._listener.hold()
             self._poller.read_after_others(self._listener.read_on)
@@ -401,7 +423,7 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
 
 
 class Listener(picows.WSListener):  # type: ignore[misc]
-    """Passes frames of one robot's socket to its connection, and is the connection's `Wire`."""
+    """Passes the frames of one robot's socket to its `RobotConnection`, and writes for it as its `Wire`."""
 
     def __init__(self, dispatcher: Dispatcher, accepted: Accepted, number: int) -> None:
         self._dispatcher = dispatcher
@@ -444,7 +466,7 @@ class Listener(picows.WSListener):  # type: ignore[misc]
             self._cut = self._loop.call_later(
                 self._dispatcher.context.settings.serving.slow_reader_timeout_s, self._cut_off
             )
-            # The commands of a robot that does not read its answers are not read either.
+            # No further commands are read from a robot that does not read its answers.
             self.hold()
 
     def resume_writing(self) -> None:
@@ -497,8 +519,9 @@ class Listener(picows.WSListener):  # type: ignore[misc]
 
     def close(self, code: int, reason: str) -> None:
         self._transport.send_close(code, reason.encode()[:_MAX_CLOSE_REASON_BYTES])
-        # Closing with unread bytes would reset the connection, and the robot would not see the code.
-        with contextlib.suppress(OSError):  # the robot reset it, and the loop has not noticed yet
+        # Only this side is closed now: closing the socket with unread bytes would reset the connection, and
+        # the robot would not get the close code.
+        with contextlib.suppress(OSError):  # the robot has reset the connection, unnoticed by the event loop
             self._transport.underlying_transport.write_eof()
         if self._linger is None:
             self._linger = self._loop.call_later(_LINGER_S, self._transport.disconnect, False)
