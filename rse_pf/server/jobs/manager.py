@@ -1,7 +1,8 @@
-"""The long jobs of one worker: the commands that wait for each job, its progress, and the answers.
+"""The queue of long services: a job for each different request, and the commands that wait for its result.
 
-A job is identified by its robot and the digest of its request, so that two equal requests wait for one job.
-It outlives the connection of its robot.  Nothing here blocks the event loop, and progress is sent at most
+A job is identified by its robot and the digest of its request, so that two equal requests of a robot wait for
+the same job.  A job continues when the connection of its robot is closed, and the robot gets the result when
+it connects again and repeats the request.  Nothing here blocks the event loop, and progress is sent at most
 twice a second.
 """
 
@@ -35,14 +36,16 @@ from rse_pf.wire.arrays import extension_hook
 
 __all__ = ["JobManager"]
 
-MAX_WAITING_JOBS = 8  # jobs of a worker that may wait: with more, a robot waits for minutes
-_PROGRESS_INTERVAL_S = 0.5  # shortest time between two progress messages for one command
-_BUSY_RETRY_MS = 5000.0  # pause of a robot whose job is refused: jobs take seconds to minutes
-_CLOSE_TIMEOUT_S = 1.0  # for the records of jobs that are given up when the worker exits
+MAX_WAITING_JOBS = 8  # jobs of a worker beyond those that may run: with more, a robot would wait for minutes
+_PROGRESS_INTERVAL_S = 0.5  # shortest time in seconds between two progress messages for one command
+_BUSY_RETRY_MS = 5000.0  # milliseconds until a refused job may be sent again: jobs take seconds to minutes
+_CLOSE_TIMEOUT_S = 1.0  # seconds that an exiting worker waits until the jobs that it gives up are recorded so
 
 
 @dataclass(eq=False, slots=True)
 class _Waiter:
+    """A command that waits for the result of a job."""
+
     queued: QueuedCommand
     last_progress_s: float = float("-inf")
     is_progress_due: bool = False
@@ -50,11 +53,14 @@ class _Waiter:
 
 @dataclass(eq=False, slots=True)
 class _Entry:
+    """A job, and the commands that wait for its result; ``done`` (0..1) and ``what`` are its progress."""
+
     request: JobRequest
     signals: JobSignals
     waiters: list[_Waiter] = field(default_factory=list)
     resubmitted: list[QueuedCommand] = field(default_factory=list)
-    """The same request, received while its job was being cancelled or displaced."""
+    """Commands with the same request that came while the job was being cancelled or given up; they are
+    submitted again after its end."""
     done: float = 0.0
     what: str = WAITING
     thread: threading.Thread | None = None
@@ -62,7 +68,7 @@ class _Entry:
 
 
 class JobManager(CommandQueue):
-    """The jobs for which robots of one worker wait, on whichever server they run."""
+    """The jobs for which robots of one worker wait; another worker or server may run them."""
 
     def __init__(
         self,
@@ -77,14 +83,13 @@ class JobManager(CommandQueue):
         """Start nothing yet.
 
         Args:
-            context: Store, slots, processes and settings; those that a result depends on are part of a
-                job's name.
-            loop: Event loop of the worker.
-            log: Log of the worker.
+            context: Store, slots, processes and settings of the worker.
+            loop: The event loop of the worker.
+            log: The log of the worker.
             answer: Called exactly once for each submitted command whose robot stays connected, unless the
-                server drains before the job's end.
+                server drains before the job has ended.
             progress: Called with the connection of a command, and the progress of its job.
-            owner: Name of this worker, unique among the workers of all servers.
+            owner: Name of this worker in the records of jobs, unique among the workers of all servers.
         """
         self._context = context
         self._max_jobs = context.settings.serving.max_running_jobs + MAX_WAITING_JOBS
@@ -105,16 +110,18 @@ class JobManager(CommandQueue):
         self._settings_digest = _settings_digest(context.settings)
 
     held = 0
-    """Commands for which a draining server waits: none, because other servers start these jobs again."""
+    """Number of commands that must be answered before the worker exits: 0, because other servers continue
+    these jobs when robots send the requests again."""
 
     def offers(self, service: str) -> bool:
-        """Return whether *service* is a long one."""
+        """Return whether *service* is a long service of this server."""
         return service in self._context.services
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Start the job of *queued*, unless it runs or is done already; the answer comes later.
+        """Let *queued* wait for the job of its request, and start the job unless it has an entry already.
 
-        While the server drains nothing is answered: the robot sends the command again to another server.
+        The command is refused if too many jobs wait.  While the server drains, it is ignored: the robot sends
+        it again to another server.
         """
         if self._leaving:
             return
@@ -148,12 +155,15 @@ class JobManager(CommandQueue):
         self._send_progress(entry, waiter)
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return how many commands of the robot have no answer yet."""
+        """Return how many commands to long services, of the robot of *queued*, have no answer yet."""
         entries = [entry for entry in self._entries.values() if entry.request.robot == queued.robot]
         return QueueBacklog(sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries))
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """Cancel one command; its job ends unless another command waits for it."""
+        """Cancel the command *command_id* of the connection *owner*.
+
+        If no other command waits for its job, the job is cancelled, and the command is answered after that.
+        """
         for entry in list(self._entries.values()):
             for waiter in list(entry.waiters):
                 if waiter.queued.owner is owner and waiter.queued.command.id == command_id:
@@ -165,20 +175,20 @@ class JobManager(CommandQueue):
                     return
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
-        """Forget the commands of a connection that ended; their jobs continue until the robot reconnects."""
+        """Forget the commands of the closed connection *owner*, and return none; their jobs continue."""
         for entry in self._entries.values():
             entry.waiters = [waiter for waiter in entry.waiters if waiter.queued.owner is not owner]
             entry.resubmitted = [queued for queued in entry.resubmitted if queued.owner is not owner]
         return []
 
     def give_up(self) -> None:
-        """Leave all jobs to other servers, and accept no further commands."""
+        """Stop all jobs, so that other servers can run them, and ignore further commands."""
         self._leaving = True
         for entry in self._entries.values():
             entry.signals.give_up()
 
     def close(self) -> None:
-        """Give up all jobs and wait, for a limited time, until their records say so."""
+        """Give up all jobs, and wait at most `_CLOSE_TIMEOUT_S` until this is in their records."""
         self.give_up()
         until = self._context.clock() + _CLOSE_TIMEOUT_S
         for entry in list(self._entries.values()):
@@ -186,10 +196,11 @@ class JobManager(CommandQueue):
                 entry.thread.join(max(0.0, until - self._context.clock()))
 
     def _has_capacity(self, request: JobRequest) -> bool:
-        """Return whether one more job may wait.
+        """Return whether the job of *request* may be added.
 
-        If all places are taken, the newest waiting job of a robot that has more is refused instead
-        (`largest_holder`).
+        If the worker has its greatest number of jobs, the newest waiting job of a robot with more jobs is
+        given up, and its commands are refused as busy (`largest_holder`).  Without such a job the result is
+        False.
         """
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
         if len(here) < self._max_jobs:
@@ -207,6 +218,8 @@ class JobManager(CommandQueue):
         return True
 
     def _begin(self, entry: _Entry) -> None:
+        """Run the job of *entry* in a new thread, which then collects old records of jobs."""
+
         def work() -> None:
             in_loop = self._loop.call_soon_threadsafe
 
@@ -215,7 +228,7 @@ class JobManager(CommandQueue):
 
             try:
                 outcome = run_job(entry.request, self._context, entry.signals, report, self._owner)
-            except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
+            except Exception as error:  # noqa: BLE001  after a defect the robot must get an answer, too
                 self._log.error("job-defect", service=entry.request.service, reason=repr(error))
                 hint = "see job-defect in the server's log"
                 outcome = JobOutcome(error=RsePfError("the job failed", hint=hint))
@@ -227,9 +240,9 @@ class JobManager(CommandQueue):
         entry.thread.start()
 
     def report(self) -> QueueReport:
-        """Return how many jobs robots of this worker wait for, and how many of these run nowhere yet.
+        """Return the number of this worker's jobs, of those that wait for a slot, and CPU seconds by tenant.
 
-        The CPU seconds are those of the jobs that have run on this worker and ended.
+        The CPU seconds are those of jobs that this worker has run and that have ended.
         """
         pending = sum(entry.what == WAITING for entry in self._entries.values())
         return QueueReport(
@@ -243,6 +256,7 @@ class JobManager(CommandQueue):
             self._send_progress(entry, waiter)
 
     def _send_progress(self, entry: _Entry, waiter: _Waiter) -> None:
+        """Send the progress of *entry* to one command, now or when `_PROGRESS_INTERVAL_S` has passed."""
         now = self._context.clock()
         wait_s = waiter.last_progress_s + _PROGRESS_INTERVAL_S - now
         if wait_s <= 0:
@@ -262,6 +276,10 @@ class JobManager(CommandQueue):
                 self._send_progress(entry, waiter)
 
     def _on_outcome(self, entry: _Entry, outcome: JobOutcome) -> None:
+        """Remove the job, answer the commands that wait for it, and submit the resubmitted ones.
+
+        A job that was given up is not answered.
+        """
         request = entry.request
         self._cpu_s[request.robot.tenant] += outcome.cpu_s
         del self._entries[request.robot, request.key]
@@ -302,7 +320,7 @@ class JobManager(CommandQueue):
 
 
 def _settings_digest(settings: PlatformSettings) -> str:
-    """Return the digest of the settings that the result of a job depends on."""
+    """Return the sha256 of the settings on which the result of a job depends; it is part of the job's key."""
     plain = settings.to_dict()
     chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
     return hashlib.sha256(chosen.encode()).hexdigest()

@@ -1,8 +1,12 @@
-"""The process of one job: the worker starts it with `spawner`, it runs one command and exits.
+"""The process of one job: a worker starts it (`spawner`), and it runs one job and exits (`run`).
 
-Over one socket it receives an order, sends progress and then one answer.  It runs at a lower priority than
-the workers, within its memory limit, and does not outlive its worker.  It reads its inputs and stores its
-reply itself, so that the worker can serve robots meanwhile.
+1. It receives an order from the worker on its socket: the job's request and the settings.
+2. It reads the stored objects to which the request refers, and calls the service.
+3. It sends progress to the worker meanwhile.  Any message from the worker cancels the job.
+4. It stores the reply, and sends one answer: ``stored`` (or ``done`` without access to the store), or
+   ``failed``.
+
+It runs at a lower priority than the workers, within a memory limit, and is killed when its worker exits.
 """
 
 from __future__ import annotations
@@ -42,19 +46,20 @@ from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = ["JobRequest", "inline_bytes", "retry_store", "run", "spawner", "store_reply"]
 
-# Niceness of a job.  On a busy core the scheduler of Linux gives it a tenth of the time, so that it ends, and
-# nine tenths to the commands of robots.
+# Niceness of a job's process.  On a busy core, Linux then gives a tenth of the time to the job, so that it
+# makes progress, and nine tenths to the commands of robots.
 _NICE = 10
-_REPORT_INTERVAL_S = 0.5  # shortest time between two progress messages to the worker
-_STORE_TRIES = 3  # of an operation of the store, before the job fails
+_REPORT_INTERVAL_S = 0.5  # shortest time in seconds between two progress messages to the worker
+_STORE_TRIES = 3  # tries of an operation on the object store, before the job fails
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRequest:
-    """A job that a robot requested.
+    """The request of a job.
 
-    ``quota_bytes`` limits all that the robot stores, results included; None for ``data.quota_bytes``.
+    ``key`` is the digest of the request (`job_key`).  ``quota_bytes`` is the quota of all objects of the
+    robot, the reply of the job included; None for ``data.quota_bytes``.
     """
 
     service: str
@@ -67,7 +72,10 @@ class JobRequest:
 
 
 def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], Child]:
-    """Return a function that starts the process of a job; *services* is ``module:function``."""
+    """Return a function that starts the process of a job and sends it the order.
+
+    *services* is the ``module:function`` that returns the registry of services.
+    """
     plan = ChildPlan(
         target=f"{__name__}:run", name="rse-pf job", policy="batch", nice=_NICE, is_killed_first=True,
         memory_bytes=settings.serving.max_job_memory_bytes,
@@ -83,12 +91,15 @@ def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest],
 
 
 def inline_bytes(settings: PlatformSettings) -> int:
-    """Return the size above which a reply is answered with the name of its object."""
+    """Return the size in bytes above which a robot gets only the digest of a stored reply, and not the reply.
+
+    It is half of ``session.max_message_bytes``, since the codec of the robot may need more bytes.
+    """
     return settings.session.max_message_bytes // 2
 
 
 def retry_store(act: Callable[[], T]) -> T:
-    """Call *act* and return its result; a failure of the store repeats it, at most twice."""
+    """Return the result of *act*; after a StoreError, call it again, at most `_STORE_TRIES` times in all."""
     for _ in range(_STORE_TRIES - 1):
         with contextlib.suppress(StoreError):
             return act()
@@ -96,14 +107,14 @@ def retry_store(act: Callable[[], T]) -> T:
 
 
 def run(worker: socket.socket) -> None:
-    """Run the one job that the *worker* orders."""
+    """Run the one job that is ordered on the socket *worker*; the entry point of the process."""
     with worker:
         order = receive(worker)
         if order is None:
             return
         settings, request = PlatformSettings.from_dict(order["settings"]), _request(order["request"])
         answer = _work(request, settings, order["services"], _Reporter(worker, time.monotonic))
-        with contextlib.suppress(OSError):  # the worker may have gone
+        with contextlib.suppress(OSError):  # the worker may have exited
             worker.sendall(encode_message(store_reply(answer, request, settings)))
 
 
@@ -112,7 +123,7 @@ def _request(plain: dict[str, Any]) -> JobRequest:
 
 
 class _Reporter:
-    """Sends progress to the worker; raises Cancelled when the worker has sent anything."""
+    """Sends the progress of the job to the worker; raises Cancelled if the worker has sent any message."""
 
     def __init__(self, worker: socket.socket, clock: Callable[[], float]) -> None:
         self._worker = worker
@@ -157,7 +168,7 @@ def _work(
 
 
 def _resolve_payload(request: JobRequest, kind: type[Any], settings: PlatformSettings) -> Any:
-    """Return the payload with the robot's objects in place of their names."""
+    """Return the payload with the bytes of the robot's objects in place of references to them."""
     if not named_in(kind, request.payload):
         return request.payload
     store = open_data_store(settings)
@@ -165,15 +176,19 @@ def _resolve_payload(request: JobRequest, kind: type[Any], settings: PlatformSet
 
 
 def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:
-    """Raise QuotaExceeded before the work if its result cannot be stored."""
+    """Raise QuotaExceeded, before the work, if the robot cannot store one more byte."""
     if is_shared(settings):
         store = open_data_store(settings)
-        with contextlib.suppress(StoreError):  # the store is tried again when there is a result
+        with contextlib.suppress(StoreError):  # storing the reply is tried in any case
             Accounts(store, settings.data).check_room(request.robot, 1, request.quota_bytes)
 
 
 def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettings) -> list[Any]:
-    """Store the reply from this process and answer with its name, and with the reply if it is small."""
+    """Store the reply in *answer*, and return the answer with its digest, and with the reply if it is small.
+
+    A failed answer, and any answer if this process has no access to the store, is returned unchanged.  If the
+    reply cannot be stored, the answer is a failure.
+    """
     if answer[0] != "done" or not is_shared(settings):
         return answer
     _, compute_ms, reply = answer

@@ -1,9 +1,11 @@
 """Garbage collection of job records that are unchanged for `RECORD_TTL_S`.
 
-A record is marked with the time when it is first seen; the next renewal of a running job removes the mark.  A
-record with an old mark is replaced by a tombstone and then deleted.  Each step is a compare-and-swap, so that
-a running job keeps its record, and a robot that asks meanwhile gets the stored result or a new run.  Results
-belong to the robot and are not deleted.
+1. A collector that reads a record without a mark writes the present time into it as a mark (``marked_s``).
+   The next renewal of a running job removes the mark.
+2. A record whose mark is older than `RECORD_TTL_S` is replaced by a tombstone (state ``swept``), and deleted.
+
+Each write is a compare-and-swap, so that a running job keeps its record, and a robot that requests the job
+meanwhile gets the stored result or a new run.  Results are objects of the robot and are not deleted.
 """
 
 from __future__ import annotations
@@ -20,16 +22,15 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["RECORD_TTL_S", "RecordCollector"]
 
-RECORD_TTL_S = 604_800.0  # a record that was not written for a week is deleted; its request then runs again
-_PREFIX = "jobs/"
-_LIST_INTERVAL_S = (
-    3600.0  # between two listings of all records: each costs one request to the store for 1,000 records
-)
-_BATCH = 64  # records read in one call, which blocks the thread of a job
+RECORD_TTL_S = 604_800.0  # seconds without a write (a week) after which a record is deleted
+_PREFIX = "jobs/"  # of the object names of all records
+# Seconds between two listings of all records: a listing costs one request to the store for 1,000 records.
+_LIST_INTERVAL_S = 3600.0
+_BATCH = 64  # records read in one call of `collect`, which blocks the thread of a job that has ended
 
 
 class RecordCollector:
-    """Collects the records of one store, a few at a time, whenever a job has ended."""
+    """Deletes old records of jobs, a few at a time, whenever a job of this worker has ended."""
 
     def __init__(
         self,
@@ -42,10 +43,10 @@ class RecordCollector:
         """Read nothing yet.
 
         Args:
-            store: Shared by all servers; their collections do not disturb each other.
-            ttl_s: A record that its owner did not write for this long is deleted.
-            clock: Monotonic seconds.
-            wall_clock: Unix seconds; may differ between machines by far less than *ttl_s*.
+            store: The object store, shared by all servers; several servers may collect at the same time.
+            ttl_s: Seconds for which a record must be unchanged before it is deleted.
+            clock: Returns monotonic seconds.
+            wall_clock: Returns Unix seconds; the difference between machines must be far less than *ttl_s*.
         """
         self._store = store
         self._ttl_s = ttl_s
@@ -56,9 +57,10 @@ class RecordCollector:
         self._lock = threading.Lock()
 
     def collect(self) -> int:
-        """Read the next few records and return how many were deleted; blocks for the store.
+        """Read the next `_BATCH` records, and return how many were deleted; blocks on the store.
 
-        Returns 0 at once while another thread is here.  Records that fail are tried in the next round.
+        Returns 0 at once if another thread collects, or if the last listing was read and is not an hour old.
+        A record for which the store fails is tried again after the next listing.
         """
         if not self._lock.acquire(blocking=False):
             return 0
@@ -74,6 +76,7 @@ class RecordCollector:
             self._lock.release()
 
     def _collect(self, name: str) -> bool:
+        """Mark or delete one record by the rule of this module; return whether it was deleted."""
         lease = Lease(self._store, name, decode_record, self._clock)
         try:
             record, now = lease.read(), self._wall_clock()
@@ -88,5 +91,5 @@ class RecordCollector:
                 return False
             self._store.delete(name)
         except StoreError:
-            return False  # the next round reads it again
+            return False  # the record is read again after the next listing
         return True

@@ -1,10 +1,12 @@
-"""Run or follow one job in a thread of the worker, and return its outcome.
+"""Run one job, or follow its run by another worker, in a thread of this worker; return its outcome.
 
-1. Read the record of the job.  If it is done, return its result.
-2. If another worker runs it, follow its progress until it ends, or until its lease expires.
-3. Otherwise wait for a slot, claim the lease, run the job in a process, and renew the lease meanwhile.
+1. Read the record of the job.  If the job is done, return its stored result.
+2. If another worker runs the job, report its progress until the job has ended or its lease has expired, and
+   continue with step 1.
+3. Otherwise wait for a slot of this server, claim the lease, run the job in a process, and renew the lease
+   meanwhile.
 
-The thread only waits: for the store, for a slot, and for the process.  The process has ended when `run_job`
+The thread only waits: for the store, for a slot, or for the process.  The process has exited when `run_job`
 returns.
 """
 
@@ -46,18 +48,21 @@ from rse_pf.storage.quotas import Accounts
 
 __all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
 
-MAX_JOB_S = 3600.0  # a job that runs longer is killed: the largest merge that is accepted takes an hour
-_POLL_SHARE = 0.5  # of the time between two renewals: a follower reads the record this often
-_KILL_AFTER_S = 0.6  # a cancelled job has this long to exit before it is killed
-_READ_BYTES = 1 << 18
-# What a job does, in its progress messages.
+MAX_JOB_S = 3600.0  # seconds after which a running job is killed: the largest accepted merge takes an hour
+_POLL_SHARE = 0.5  # a follower reads the record after this share of the time between two renewals
+_KILL_AFTER_S = 0.6  # seconds in which the process of a cancelled job can exit before it is killed
+_READ_BYTES = 1 << 18  # bytes read from the process at a time
+# The text ``what`` of the progress of a job that waits for a slot, and of one whose process starts.
 WAITING = "waits for its turn"
 STARTING = "starts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobContext:
-    """The values that all jobs of one worker share."""
+    """The values that all jobs of one worker share.
+
+    ``start`` starts the process of a job, ``clock`` returns monotonic seconds.
+    """
 
     store: ObjectStore
     slots: JobSlots
@@ -66,29 +71,30 @@ class JobContext:
     start: Callable[[JobRequest], Child]
     clock: Callable[[], float]
     services: frozenset[str] = frozenset()
-    """Names of the long services, which run as jobs."""
+    """Names of the long services, whose commands run as jobs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """The end of a job: a reply with its digest, an error, or neither if the job was given up."""
+    """How a job ended: with a stored reply, with an error, or with neither if it was given up."""
 
     object: str = ""
+    """Digest of the stored reply, an object of the robot."""
     reply: bytes | None = None
-    """MessagePack; None if it is too large to be sent along."""
+    """The reply as MessagePack; None if it is larger than `inline_bytes`: the robot gets the digest only."""
     compute_ms: float = 0.0
     error: RsePfError | None = None
     cpu_s: float = 0.0
-    """CPU seconds of its process, if it ran on this server."""
+    """CPU seconds of the job's process; 0 if another worker ran the job."""
 
     @property
     def is_given_up(self) -> bool:
-        """Whether another server should take the job."""
+        """Whether the job was stopped before its end, so that another server should run it."""
         return not self.object and self.error is None
 
 
 class JobSignals:
-    """Signals of the worker to the thread of a job; they are never cleared."""
+    """The signals ``cancelled`` and ``giving_up`` of the event loop to the thread of a job; never cleared."""
 
     def __init__(self) -> None:
         self.cancelled = False
@@ -97,18 +103,18 @@ class JobSignals:
         self._lock = threading.Lock()
 
     def cancel(self) -> None:
-        """Signal that the robot cancelled the job."""
+        """Signal that the robot cancelled the job, and wake the thread."""
         self.cancelled = True
         self._wake()
 
     def give_up(self) -> None:
-        """Signal that another server should take the job."""
+        """Signal that another server should run the job, and wake the thread."""
         self.giving_up = True
         self._wake()
 
     def wait(self, seconds: float, *others: socket.socket) -> bool:
-        """Wait for a signal or for bytes on *others*; return False if a signal was set."""
-        poller = select.poll()  # select() takes no descriptor above 1,023, and a worker has thousands
+        """Wait at most *seconds* for a signal or for bytes on *others*; return False if a signal was set."""
+        poller = select.poll()  # select() accepts no descriptor above 1,023, and a worker has thousands
         poller.register(self._fd, select.POLLIN)
         for other in others:
             poller.register(other, select.POLLIN)
@@ -117,7 +123,7 @@ class JobSignals:
         return not (self.cancelled or self.giving_up)
 
     def close(self) -> None:
-        """Free the descriptor; later signals are ignored."""
+        """Close the descriptor of this object; later signals wake nothing."""
         with self._lock:
             os.close(self._fd)
             self._fd = -1
@@ -131,14 +137,15 @@ class JobSignals:
 def run_job(
     request: JobRequest, context: JobContext, signals: JobSignals, report: Report, owner: str
 ) -> JobOutcome:
-    """Run or follow the job and return its outcome; blocks until then.
+    """Run the job, or follow its run by another worker, until it has ended; return the outcome.
 
     Args:
-        request: The job.
+        request: The request of the job.
         context: The values that all jobs of the worker share.
         signals: Signals of the worker's event loop.
-        report: Called in this thread with the share that is done (0..1), and with what is being done.
-        owner: Name that is unique to this process, which runs each job at most once at a time.
+        report: Called in this thread with the share of the job that is done (0..1), and what is being done.
+        owner: Name of this worker, unique among the workers of all servers; it runs each job at most once at
+            a time.
     """
     name = record_name(request.robot, request.key)
     lease = JobLease(context.store, name, owner, context.clock)
@@ -191,7 +198,7 @@ def _follow_or_run(
 
 
 def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:
-    """Return the result that *record* names; None if it was deleted and must be computed again."""
+    """Return the stored result of a job that is done; None if the robot has deleted its object meanwhile."""
     name = object_name(request.robot, record.reply)
     try:
         reply = None
@@ -205,7 +212,7 @@ def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord)
 
 
 class _JobRun:
-    """The run of a job whose lease this worker holds."""
+    """Runs a job, whose lease this worker holds, in a process, and writes the outcome to its record."""
 
     def __init__(
         self, request: JobRequest, context: JobContext, signals: JobSignals, report: Report, lease: JobLease
@@ -221,18 +228,19 @@ class _JobRun:
         self._is_over = False
 
     def work(self) -> JobOutcome | None:
-        """Return the outcome; None if another server took the job."""
+        """Run the job and return its outcome; None if another worker took the lease meanwhile."""
         self._report(0.0, STARTING)
         process = self._context.start(self._request)
         try:
             why = self._supervise(process)
         finally:
             cpu_s = cpu_seconds(process.pid)
-            exit_code = process.kill()  # all its messages have been read
+            exit_code = process.kill()  # all messages of the process have been read
         outcome = self._outcome_of(why, exit_code)
         return None if outcome is None else replace(outcome, cpu_s=cpu_s)
 
     def _outcome_of(self, why: str, exit_code: int) -> JobOutcome | None:
+        """Write the outcome to the record and return it; *why* is the result of `_supervise`."""
         if why == "lost":
             return None
         if why == "given-up":
@@ -255,7 +263,11 @@ class _JobRun:
         )
 
     def _supervise(self, process: Child) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
-        """Read from the process and renew the lease until the run ends."""
+        """Read from the process and renew the lease until the run ends; return why it ended.
+
+        That is: over (the process has answered or exited), lost (another worker has the lease), given-up,
+        cancelled, or late (after `MAX_JOB_S`).
+        """
         serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
         began = clock()
         next_heartbeat, killed_s = began + renewal_s(serving.job_lease_s), float("inf")
@@ -285,11 +297,12 @@ class _JobRun:
         return self._signals.cancelled or (record is not None and self._lease.is_ours and record.cancel)
 
     def _renew(self) -> None:
-        """Renew the lease; while the store fails, the job runs on, unless another server takes it."""
+        """Renew the lease; a failure of the store is ignored, so that the job continues meanwhile."""
         with suppress(StoreError):
             self._lease.renew(self._done, self._what)
 
     def _read(self, process: Child) -> None:
+        """Read the messages that have arrived from the process; report progress, keep the final answer."""
         try:
             data = process.connection.recv(_READ_BYTES, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -308,7 +321,7 @@ class _JobRun:
             self._end, self._is_over = ["failed", error.code, error.message, "ask for less"], True
 
     def _store_reply(self, compute_ms: float, reply: bytes) -> JobOutcome:
-        """Store the reply before it is reported; used where the process has no access to the store."""
+        """Store the reply in this worker, for a process without access to the store; return the outcome."""
         context, request, digest = self._context, self._request, digest_of(reply)
         try:
             accounts = Accounts(context.store, context.settings.data)
@@ -321,7 +334,10 @@ class _JobRun:
         return self._report_stored(compute_ms, digest, len(reply), inline)
 
     def _report_stored(self, compute_ms: float, digest: str, size: int, reply: bytes | None) -> JobOutcome:
-        """Write to the record where the stored reply is; return it, too, if *reply* is small."""
+        """Write to the record that the reply is stored as object *digest*, and return the outcome.
+
+        *size* is the length of the stored reply; *reply* is the reply itself, None if it is large.
+        """
         self._end_lease(
             JobRecord(
                 state="done", owner="", reply=digest, reply_bytes=size, compute_ms=compute_ms,
@@ -346,5 +362,6 @@ def _cancelled_error() -> RsePfError:
 
 def _crash_error(code: int) -> RsePfError:
     return Crashed(
-        f"the job's process ended: {how_ended(code)}", hint="the server's log has what it printed last"
+        f"the job's process ended: {how_ended(code)}",
+        hint="the server's log has the last output of the process",
     )

@@ -1,7 +1,8 @@
-"""Slots to run a job, shared by all workers of a server: a record lock on one byte of a file for each slot.
+"""Limit the jobs that run on a server at the same time: each needs a slot, shared by all workers.
 
-The kernel releases the locks of a process that ends, so a worker that crashes gives its slots back.  Within a
-worker the order is that of `FairQueue`.
+A slot is a record lock (fcntl) on one byte of a file in memory.  The kernel releases the locks of a process
+that exits, so that the slots of a crashed worker become free.  Which job of a worker gets the next slot is
+decided by a `FairQueue`: fair between tenants, then between the robots of a tenant.
 """
 
 from __future__ import annotations
@@ -16,32 +17,37 @@ from rse_pf.limits.fair_queue import FairQueue
 
 __all__ = ["JobSlots", "make_slot_file"]
 
-_POLL_S = 0.1  # between two tries to get a slot, since the kernel reports no released lock
+_POLL_S = 0.1  # seconds between two tries to get a slot, since the kernel does not report a released lock
 
 
 def make_slot_file() -> int:
-    """Return the descriptor of a file in memory, which every worker of a server inherits."""
+    """Return the descriptor of a new file in memory, for the locks; every worker of a server inherits it."""
     return os.memfd_create("job-slots")
 
 
 class JobSlots:
-    """The slots for the threads of one worker; at most one object in a process."""
+    """Acquires and releases slots for the threads of one worker; a process may have only one such object."""
 
     def __init__(self, file: int, count: int) -> None:
-        """Take no slot yet.
+        """Acquire no slot yet.
 
         Args:
-            file: Of `make_slot_file`; closing a descriptor of it would release the slots of this process.
+            file: The result of `make_slot_file`; closing any descriptor of that file would release the slots
+                of this process.
             count: Number of slots of the server.
         """
         self._file, self._count = file, count
         self._taken: set[int] = set()
-        """Slots of this worker, because the kernel grants a lock to the same process again."""
+        """Slots that this worker has: the kernel would grant such a lock to the same process once more."""
         self._queue: FairQueue[object] = FairQueue()
         self._lock = threading.Lock()
 
     def acquire(self, robot: RobotId, wait: Callable[[float], bool]) -> bool:
-        """Wait for a slot for *robot*; False if *wait*, called with seconds to wait, returned False."""
+        """Wait for a slot for a job of *robot* and return True; `release` frees the slot.
+
+        Between two tries, *wait* is called with a number of seconds, for which it waits.  If it returns
+        False, no slot is acquired, and this method returns False.
+        """
         ticket = object()
         with self._lock:
             self._queue.add(robot, ticket)
@@ -55,7 +61,7 @@ class JobSlots:
                 self._queue.remove(lambda waiting: waiting is ticket)
 
     def release(self) -> None:
-        """Free a slot of this worker."""
+        """Free one slot of this worker; which one does not matter."""
         with self._lock:
             fcntl.lockf(self._file, fcntl.LOCK_UN, 1, self._taken.pop())
 
@@ -64,7 +70,7 @@ class JobSlots:
             if self._queue.peek() is not ticket or not self._take_any():
                 return False
             self._queue.take()
-            self._queue.release(robot)  # a slot is freed without a name: only the order counts
+            self._queue.release(robot)  # the queue only decides the order; it need not know what still runs
             return True
 
     def _take_any(self) -> bool:
@@ -73,7 +79,7 @@ class JobSlots:
                 try:
                     fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, slot)
                 except (BlockingIOError, PermissionError):
-                    continue  # another worker has it
+                    continue  # another worker has this slot
                 self._taken.add(slot)
                 return True
         return False
