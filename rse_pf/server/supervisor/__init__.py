@@ -1,6 +1,6 @@
-"""The main process of a server: listener, worker processes and control port.
+"""The main process of a server: it accepts sockets, controls the workers, and answers the control port.
 
-The start, replacement and end of processes belong here; messages of robots belong to `gateway`.
+The start, replacement and exit of processes belong to this package; messages of robots belong to `gateway`.
 """
 
 from rse_pf.server.supervisor.supervisor import serve

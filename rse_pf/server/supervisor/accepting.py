@@ -1,8 +1,14 @@
-"""Accept the sockets of robots, and pass on those that have begun to send.
+"""Accept the sockets of robots, and pass those that have begun to send to workers at a limited rate.
 
-To accept a socket is cheap, a handshake is not.  A socket that has sent nothing waits here for a bounded
-time, among a bounded number, and costs no worker anything.  ``serving.max_accepts_per_s`` limits the sockets
-that are passed on.  No byte is consumed here.
+1. At most `_ACCEPTS_AT_ONCE` sockets are accepted, then a pause of `_ACCEPT_PAUSE_S` follows.
+2. A socket that has sent nothing waits, for at most the Hello timeout and among a bounded number of such
+   sockets, and costs no worker anything; above the number, the one that has waited longest is closed.
+3. A socket that has begun to send takes a token from a token bucket, which gains
+   ``serving.max_accepts_per_s`` tokens a second and holds at most `HANDSHAKE_BURST`, and is passed on.
+4. Without a token it waits, first in, first out.  While `_MAX_READY` sockets wait, no further ones are
+   accepted.
+
+The bytes of a socket are not read here: the worker reads them.
 """
 
 from __future__ import annotations
@@ -22,12 +28,12 @@ from rse_pf.server.gateway.rate_limits import HANDSHAKE_BURST
 
 __all__ = ["RobotAcceptor"]
 
-_ACCEPTS_AT_ONCE = 128  # sockets accepted before a pause, so that the event loop serves others
-_ACCEPT_PAUSE_S = 0.005  # that pause: at most 25,600 sockets a second are accepted
-_MIN_PAUSE_S = 0.01  # shortest pause for the rate of accepts, so that several sockets are passed on together
-_REFUSED_PAUSE_S = 0.1  # pause after the kernel refused to accept, because no descriptor is left
-_MAX_READY = 1024  # sockets that have begun to send and wait for the rate; no more are accepted beyond it
-_LISTEN_BACKLOG = 4096  # connections that wait for accept; the kernel reduces it to net.core.somaxconn
+_ACCEPTS_AT_ONCE = 128  # sockets accepted before a pause, so that the event loop does its other work
+_ACCEPT_PAUSE_S = 0.005  # seconds of the pause after them: at most 25,600 sockets a second are accepted
+_MIN_PAUSE_S = 0.01  # shortest wait for a token in seconds, so that several sockets are passed on after it
+_REFUSED_PAUSE_S = 0.1  # seconds from an error of accept, such as no free descriptor, to the next try
+_MAX_READY = 1024  # sockets that wait for a token; while there are so many, no further sockets are accepted
+_LISTEN_BACKLOG = 4096  # connections that the kernel queues for accept; it limits this to net.core.somaxconn
 
 _PEEK = socket.MSG_PEEK | socket.MSG_DONTWAIT
 
@@ -36,7 +42,7 @@ Accepted = tuple[socket.socket, int, str]
 
 
 class RobotAcceptor:
-    """Accepts the sockets of robots; its methods are called in the event loop."""
+    """Accepts the sockets of robots on one listener; its methods are called in the event loop."""
 
     def __init__(
         self,
@@ -50,16 +56,16 @@ class RobotAcceptor:
         """Accept nothing yet.
 
         Args:
-            listener: A bound socket; closed by `close`.
-            serving: Limits of the server.
-            silent_s: A socket that sends nothing for this long is closed.
-            pass_on: Gets descriptor, number and address of a socket that has begun to send; the descriptor is
-                closed afterwards.
-            on_refused: Gets the reason when the system accepts no more.
+            listener: A bound socket; `close` closes it.
+            serving: Settings with the limits of the server.
+            silent_s: Seconds after which a socket that has sent nothing is closed.
+            pass_on: Called with descriptor, number and address of a socket that has begun to send; the
+                descriptor is closed after the call.
+            on_refused: Called with the reason when accept fails.
         """
         self._listener = listener
         self._accept: Callable[[], tuple[int, Any]] = listener._accept  # type: ignore[attr-defined]
-        """`socket.accept` without the questions about family and kind of the socket."""
+        """As `socket.accept`, without the system calls for family and type of the new socket."""
         self._serving = serving
         self._silent_s = silent_s
         self._pass_on = pass_on
@@ -71,11 +77,11 @@ class RobotAcceptor:
         self._silent: SilentConnections[Accepted] | None = None
         self._accepted = 0
         self.pauses = 0
-        """How often a socket had to wait for the rate."""
+        """Number of times that passing on had to wait for a token."""
 
     @property
     def cut(self) -> int:
-        """How many sockets were cut because they sent nothing."""
+        """Number of sockets that were closed because they sent nothing."""
         return self._silent.cut if self._silent is not None else 0
 
     def open(self) -> None:
@@ -93,7 +99,7 @@ class RobotAcceptor:
         self._loop.add_reader(self._listener.fileno(), self._accept_some)
 
     def close(self) -> None:
-        """Accept no more, and cut who waits here."""
+        """Close the listener and all sockets that were not passed on."""
         for pause in (self._accept_pause, self._rate_pause):
             if pause is not None:
                 pause.cancel()
@@ -105,8 +111,6 @@ class RobotAcceptor:
             self._silent.cut_all()
             while self._ready:
                 self._ready.popleft()[0].close()
-
-    # --- accepting -------------------------------------------------------------------------------
 
     def _accept_some(self) -> None:
         for _ in range(_ACCEPTS_AT_ONCE):
@@ -126,28 +130,27 @@ class RobotAcceptor:
         self._pause_accepting(_ACCEPT_PAUSE_S)
 
     def _pause_accepting(self, pause_s: float) -> None:
-        """Stop watching the listener for *pause_s*; it stays readable meanwhile."""
+        """Accept no socket for *pause_s* seconds; new connections wait in the kernel."""
         self._loop.remove_reader(self._listener.fileno())
         self._accept_pause = self._loop.call_later(pause_s, self._accept_on)
 
     def _accept_on(self) -> None:
         self._loop.add_reader(self._listener.fileno(), self._accept_some)
 
-    # --- silent sockets --------------------------------------------------------------------------
-
     def _take(self, accepted: Accepted) -> None:
+        """Pass on or queue a new socket that has begun to send; wait for the first bytes of any other."""
         assert self._silent is not None
         connection, _, address = accepted
         if self._has_begun(accepted):
             self._serve_ready(accepted)
             return
         if connection.fileno() < 0:
-            return  # it has ended
+            return  # the other end has closed the connection
         self._loop.add_reader(connection.fileno(), self._begin, accepted)
         self._silent.enter(accepted, functools.partial(self._drop, accepted), address)
 
     def _begin(self, accepted: Accepted) -> None:
-        """Pass on or queue *accepted*, whose first bytes have come; drop it if it has ended instead."""
+        """Pass on or queue a waiting socket whose first bytes have come; nothing if it was closed instead."""
         assert self._silent is not None
         self._loop.remove_reader(accepted[0].fileno())
         self._silent.leave(accepted)
@@ -159,26 +162,24 @@ class RobotAcceptor:
         accepted[0].close()
 
     def _has_begun(self, accepted: Accepted) -> bool:
-        """Return whether bytes have come; a socket that has ended is closed."""
+        """Return whether bytes of the socket have come; close it if its other end was closed."""
         try:
             if accepted[0].recv(1, _PEEK):
                 return True
         except BlockingIOError:
             return False
         except OSError:
-            pass  # it was reset
+            pass  # the connection was reset
         accepted[0].close()
         return False
 
-    # --- sockets that have begun to send -----------------------------------------------------------
-
     def _serve_ready(self, accepted: Accepted) -> None:
-        """Pass on *accepted*, which has begun to send, or let it wait for the rate."""
+        """Pass on *accepted*, which has begun to send, or let it wait for a token."""
         if self._rate_pause is not None or not self._try_to_pass_on(accepted):
             self._ready.append(accepted)
 
     def _try_to_pass_on(self, accepted: Accepted) -> bool:
-        """Pass on *accepted* and return True if the rate allows it; else set a timer and return False."""
+        """Pass on *accepted* and return True if there is a token; else set a timer and return False."""
         wait_s = self._rate.take(time.monotonic()) if self._rate.rate > 0 else 0.0
         if wait_s > 0:
             self.pauses += 1
@@ -189,10 +190,10 @@ class RobotAcceptor:
         return True
 
     def _pass_on_some(self) -> None:
-        """Pass on as many sockets as the rate allows, in the order in which they began to send."""
+        """Pass on as many sockets as there are tokens, in the order in which they began to send."""
         self._rate_pause = None
         while self._ready:
-            # One may have ended while it waited.
+            # A socket may have been closed by its other end while it waited.
             if self._has_begun(self._ready[0]) and not self._try_to_pass_on(self._ready[0]):
                 return
             self._ready.popleft()

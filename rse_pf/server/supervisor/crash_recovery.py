@@ -1,8 +1,12 @@
 """Replace a worker that crashed in native code, and refuse a robot that causes such crashes.
 
-Spare processes were forked with the workers, before any event loop and thread, and one of them takes the
-place of a crashed worker.  After several crashes it begins with an exponential delay (`restart_delay_s`).  No
-further spares are forked: when they are used up, or if a worker ends in another way, the server exits.
+1. `_SPARES` spare processes are forked together with the workers, before any event loop and thread exists.
+2. When a worker is killed by a signal of `CRASH_SIGNALS`, a spare process takes its place.  From the third
+   crash within `WINDOW_S` on, it begins after an exponential delay (`restart_delay_s`).
+3. A robot whose commands caused two such crashes within `WINDOW_S` is disconnected, and refused for
+   `BLOCK_S`.
+4. No further spare processes are forked.  When all are used, or if a worker exits in another way, the server
+   exits.
 """
 
 from __future__ import annotations
@@ -24,23 +28,26 @@ from rse_pf.server.worker_context import Log
 
 __all__ = ["CrashRecovery", "restart_delay_s", "spare_plans"]
 
-_SPARES = 5  # crashes that a server survives: a spare process waits for each
-_PROMPT_RESTARTS = 2  # crashes within `WINDOW_S` without a delay: a robot that causes as many is refused
+_SPARES = 5  # spare processes, and so the number of crashes that a server survives
+_PROMPT_RESTARTS = 2  # crashes within `WINDOW_S` that cause no delay: a robot that causes as many is refused
 
 
 def restart_delay_s(crashes: int) -> float:
-    """Return how long the successor of a worker waits after the *crashes*-th crash within `WINDOW_S`."""
+    """Return the seconds that a spare process waits after the *crashes*-th crash within `WINDOW_S`.
+
+    It is 0 for the first two crashes, then 1, 2, 4 s and so on.
+    """
     return 0.0 if crashes <= _PROMPT_RESTARTS else 2.0 ** (crashes - _PROMPT_RESTARTS - 1)
 
 
 def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
-    """Return the plans of the spare processes for the workers of *plans*."""
+    """Return the plans of `_SPARES` spare processes for the workers that have *plans*."""
     spare = replace(plans[0], index=-1, is_spare=True)
     return [replace(spare, crash=CrashReport()) for _ in range(_SPARES)]
 
 
 class CrashRecovery:
-    """Replaces a server's crashed workers by spare processes; refuses robots whose commands crash workers."""
+    """Replaces crashed workers of a server by spare processes, and refuses robots that crash workers."""
 
     def __init__(
         self,
@@ -55,10 +62,10 @@ class CrashRecovery:
         """Replace nothing yet.
 
         Args:
-            workers: The workers of the server; a crashed one is replaced in this list.
-            spares: Spare processes.
-            registry: Knows the robots of connections; those of an ended worker are removed from it.
-            trust: Has the keys for a new worker; None for the keys with which the server started.
+            workers: The workers of the server; `replace` changes this list.
+            spares: The spare processes; `replace` removes those that it uses.
+            registry: Has the robot of each connection; connections of a crashed worker are removed.
+            trust: Has the keys and the roster for a new worker; None for those with which the server started.
             log: The log of the server.
             records: The audit log of the server.
         """
@@ -67,14 +74,15 @@ class CrashRecovery:
         self._crashes = CrashRecord()
         self._times: deque[float] = deque(maxlen=_SPARES)
         self.cpu_s = 0.0
-        """CPU seconds of workers that were replaced."""
+        """CPU seconds of the workers that have crashed."""
         self.count = 0
-        """Crashes since the start."""
+        """Number of crashes since the start of the server."""
 
     def replace(self, worker: WorkerProcess, now: float) -> WorkerProcess | None:
-        """Record the crash of *worker*, which ended at *now* (s), and return its successor.
+        """Record the crash of *worker*, which exited at *now* (s), and return the process that replaces it.
 
-        None if no spare is left, or if native code did not end the worker; the latter is not recorded.
+        Return None if no spare process is left, or if *worker* was not killed by a crash signal; in the
+        latter case nothing is recorded.
         """
         code = worker.exit_code(0)
         if code is None or -code not in CRASH_SIGNALS:

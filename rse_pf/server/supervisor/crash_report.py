@@ -1,8 +1,13 @@
-"""Find out after a crash in native code for which robot a worker was computing, and where.
+"""Report, after a crash of a worker in native code, for which robot the worker was computing, and where.
 
-Worker and supervisor share the memory of the report.  While a thread of the worker decodes a message of a
-connection or computes for it, the number of the connection is in that memory.  `faulthandler` writes the
-traceback of the crash behind it, and costs nothing before.  A crash at any other time is charged to no robot.
+1. Supervisor and worker share the memory of the report.
+2. While a thread of the worker decodes a message of a connection or computes for it, the number of the
+   connection is in that memory.  At other times it is 0, and a crash is charged to no robot.
+3. At a crash, `faulthandler` writes the traceback of the thread into the file of the memory.
+4. The supervisor reads the thread from the traceback, and the connection and its robot from the memory.
+
+Layout of the memory: for each of `_MAX_THREADS` threads a word with a connection number, then for each a word
+with its thread id; a table with the robots of the newest connections; the text of `faulthandler`.
 """
 
 from __future__ import annotations
@@ -25,27 +30,28 @@ from rse_pf.identity import RobotId
 __all__ = ["CRASH_SIGNALS", "Crash", "CrashReport"]
 
 CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
-"""Signals by which native code ends a process; operators and the kernel use others."""
+"""Signals that kill a process after an error in native code; operators and the kernel use other signals."""
 _MAX_THREADS = 4  # threads of a worker that are recorded: event loop, solver and decoder are three
-_THREADS = _MAX_THREADS  # index of the first word with a thread id; the words before hold connection numbers
-_ENTRY = struct.Struct("@QH")  # number of a connection, and length of its robot's name as JSON
-_ENTRY_BYTES = 640  # size of an entry with the name
-_ENTRIES = 128  # newest connections in the table of robots; the supervisor's registry has the older ones
-_TABLE = 8 * 2 * _MAX_THREADS  # offset of the table behind the words, in bytes
+_THREADS = _MAX_THREADS  # index of the first word with a thread id; the words before have connection numbers
+_ENTRY = struct.Struct("@QH")  # begin of a table entry: connection number, and bytes of its robot as JSON
+_ENTRY_BYTES = 640  # bytes of a table entry, with the robot as JSON
+_ENTRIES = 128  # entries of the table, for the newest connections; the supervisor's registry has older ones
+_TABLE = 8 * 2 * _MAX_THREADS  # offset of the table in bytes, behind two words of 8 bytes for each thread
+# Offset of the text of `faulthandler`: the first memory page behind the table.
 _TEXT = mmap.PAGESIZE * -(-(_TABLE + _ENTRY_BYTES * _ENTRIES) // mmap.PAGESIZE)
-_MAX_TEXT_BYTES = 1 << 17
+_MAX_TEXT_BYTES = 1 << 17  # bytes of that text that are read
 _THREAD = re.compile(rb"Current thread 0x([0-9a-f]{1,16}) ")
 _FRAME = re.compile(rb'File "([^"\n]{1,500})", line (\d{1,9}) in ([^\n]{1,200})')
 
 
 @dataclass(frozen=True, slots=True)
 class Crash:
-    """One crash.
+    """What a report says about the crash of a worker.
 
     Attributes:
-        number: Number of the connection for which the thread worked; 0 for none.
-        robot: Its robot; None if the connection is not among the newest, or has no token.
-        place: File, line and name of the innermost Python function.
+        number: Number of the connection for which the crashed thread worked; 0 for none.
+        robot: The robot of that connection; None if the connection is not in the table, or has no token.
+        place: ``FILE:LINE FUNCTION`` of the innermost Python function; "" if the traceback is missing.
     """
 
     number: int
@@ -54,7 +60,10 @@ class Crash:
 
 
 class CrashReport:
-    """The report of one worker; made before the worker is forked."""
+    """The crash report of one worker, in memory that it shares with the supervisor; made before the fork.
+
+    The worker calls `begin`, `enter` and `compute_for`; the supervisor calls `read` and `close`.
+    """
 
     def __init__(self) -> None:
         self._file = os.memfd_create("crash-report")
@@ -63,28 +72,26 @@ class CrashReport:
         self._memory = mmap.mmap(self._file, _TEXT)
         self._words = memoryview(self._memory)[:_TABLE].cast("Q")
         self.of_loop = self._words[:1]
-        """The connection for which the thread of the event loop works, in its only element; 0 for none."""
+        """One element: the number of the connection for which the event loop's thread works; 0 for none."""
         self._indices: dict[int, int] = {}
-        """Which word belongs to a thread."""
+        """Index of the word of each thread, by thread id."""
         self._unused = itertools.count()
 
-    # --- in the worker -------------------------------------------------------------------------------------
-
     def begin(self) -> None:
-        """Report crashes of this process from now on; called in the thread of its event loop."""
+        """Report crashes of this process from now on; the thread of its event loop must call this first."""
         self.compute_for(0)
         faulthandler.enable(self._file)
 
     def enter(self, number: int, robot: RobotId) -> None:
-        """Note the robot of the new connection *number*."""
+        """Write the robot of the new connection *number* into the table, over that of an old connection."""
         name = msgspec.json.encode(robot)[: _ENTRY_BYTES - _ENTRY.size]
         at = _TABLE + number % _ENTRIES * _ENTRY_BYTES
         self._memory[at : at + _ENTRY.size + len(name)] = _ENTRY.pack(number, len(name)) + name
 
     def compute_for(self, number: int) -> int:
-        """Note that this thread works for the connection *number* from now on; return the one before.
+        """Mark that the calling thread works for the connection *number* from now on; 0 for none.
 
-        0 stands for none.
+        Return the number that was marked before.  Threads beyond `_MAX_THREADS` are not marked, and get 0.
         """
         thread = get_ident()
         index = self._indices.get(thread)
@@ -98,10 +105,8 @@ class CrashReport:
         self._words[index] = number
         return before
 
-    # --- in the supervisor ---------------------------------------------------------------------------------
-
     def read(self) -> Crash:
-        """Return the crash; called when the worker has ended."""
+        """Return the crash of the worker, which has exited."""
         text = os.pread(self._file, _MAX_TEXT_BYTES, _TEXT)
         found = _THREAD.search(text)
         frame = None if found is None else _FRAME.search(text, found.end())
@@ -112,7 +117,7 @@ class CrashReport:
         return Crash(number, self._robot_of(number), place.decode(errors="replace"))
 
     def close(self) -> None:
-        """Free the memory."""
+        """Free the shared memory; a second call does nothing."""
         if self._file >= 0:
             self.of_loop.release()
             self._words.release()

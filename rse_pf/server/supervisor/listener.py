@@ -1,4 +1,7 @@
-"""The listening sockets of a server, which no other machine reaches without authentication."""
+"""Open the listening sockets of a server: for robots, and for the control port.
+
+A server refuses to start if robots of other machines could connect without authentication.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,11 @@ __all__ = ["bound_socket", "check_authentication", "open_control"]
 
 
 def check_authentication(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
-    """Raise ConfigurationError if robots of other machines could connect without a token."""
+    """Raise ConfigurationError if robots could connect without a token from other machines, or not at all.
+
+    That is: no tokens are required, or messages are echoed (*conformance_echo*), and ``serving.host`` is no
+    loopback address; or tokens are required, and *keys* is None.
+    """
     host = settings.serving.host
     if conformance_echo and not is_loopback(host):
         raise ConfigurationError(
@@ -37,7 +44,11 @@ def check_authentication(settings: PlatformSettings, keys: KeySet | None, confor
 
 
 def bound_socket(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound but does not listen yet; raises ConfigurationError."""
+    """Return a TCP socket that is bound to *host* and *port*, and does not listen yet.
+
+    Raises:
+        ConfigurationError: The address is not valid, or the port is taken.
+    """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)
@@ -56,7 +67,11 @@ def bound_socket(host: str, port: int) -> socket.socket:
 async def open_control(
     serving: ServingSettings, answer: Callable[[ControlRequest], Awaitable[ControlReply]]
 ) -> asyncio.Server:
-    """Listen on the control port and answer requests with *answer*; raises ConfigurationError."""
+    """Listen on the control port, and answer each request by the result of *answer*.
+
+    Raises:
+        ConfigurationError: The address is not valid, or the port is taken.
+    """
     try:
         return await serve_control(serving.control_host, serving.control_port, answer)
     except OSError as error:

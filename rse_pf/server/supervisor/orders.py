@@ -1,4 +1,4 @@
-"""The orders of a supervisor to its workers: one JSON line each on the control channel."""
+"""The orders that a supervisor sends to its workers, each as one line of JSON on the control channel."""
 
 from __future__ import annotations
 
@@ -14,50 +14,51 @@ __all__ = [
 
 
 class ReportOrder(msgspec.Struct, tag="report", tag_field="do", frozen=True):
-    """Report the metrics."""
+    """Send the metrics of the worker to the supervisor."""
 
 
 class DrainOrder(msgspec.Struct, tag="drain", tag_field="do", frozen=True):
-    """Ask every robot to move within *within_ms*, and report when all have left."""
+    """Ask every robot to move to another server within *within_ms*, and report when all have left."""
 
     within_ms: float
 
 
 class MigrateOrder(msgspec.Struct, tag="migrate", tag_field="do", frozen=True):
-    """Ask one robot after each of *delays_s* to move within *within_ms*."""
+    """After each of *delays_s* (seconds), ask one robot to move to another server within *within_ms*."""
 
     delays_s: list[float]
     within_ms: float
 
 
 class TrustOrder(msgspec.Struct, tag="trust", tag_field="do", frozen=True):
-    """Verify tokens by *snapshot*, the text of a `TrustStore`, from now on."""
+    """Verify tokens by *snapshot*: keys, roster and deny list as a `TrustStore` encodes them."""
 
     snapshot: str
 
 
 class ReplaceOrder(msgspec.Struct, tag="replace", tag_field="do", frozen=True):
-    """Close the connection *number*: its robot has a newer one."""
+    """Close the connection *number*, because its robot has a newer connection to this server."""
 
     number: int
 
 
 class BlocksOrder(msgspec.Struct, tag="blocks", tag_field="do", frozen=True):
-    """List the services and requests that are refused after crashes, in an answer with this *number*."""
+    """Send a list of the services and robots that are refused after crashes; the answer has this *number*."""
 
     number: int
 
 
 class RobotsOrder(msgspec.Struct, tag="robots", tag_field="do", frozen=True):
-    """List the connected robots, in an answer with this *number*."""
+    """Send a list of the connected robots; the answer has this *number*."""
 
     number: int
 
 
 class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
-    """Lift refusals after crashes, and list them in an answer with this *number*.
+    """Lift refusals after crashes, and send a list of those that were lifted; the answer has this *number*.
 
-    None stands for every service, every tenant, and every robot of the tenant.
+    *service*, *tenant* and *robot* select refusals; None selects all services, tenants, or robots of the
+    tenant.
     """
 
     number: int
@@ -67,24 +68,25 @@ class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
 
 
 class ReloadServicesOrder(msgspec.Struct, tag="reload-services", tag_field="do", frozen=True):
-    """Load the services folder again; if that fails, the services stay as they are, and it is logged."""
+    """Load the services folder again; if that fails, log it and keep the present services."""
 
 
 class BanOrder(msgspec.Struct, tag="ban", tag_field="do", frozen=True):
-    """Disconnect *robot*, and refuse it for *seconds*."""
+    """Disconnect *robot*, and reject its handshakes for *seconds*."""
 
     robot: RobotId
     seconds: float
 
 
 class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
-    """Take the place of worker *index*, which has crashed: the first order to a spare process.
+    """Take the place of a crashed worker; the first order to a spare process.
 
     Attributes:
-        index: The index of the worker.
-        wait_s: Seconds to wait before it begins.
-        snapshot: The text of a `TrustStore`; "" for the keys with which the server started.
-        banned: Robots that are refused, each with the number of seconds.
+        index: Index of the crashed worker, which the spare process gets.
+        wait_s: Seconds for which the spare process waits before it serves robots.
+        snapshot: Keys, roster and deny list as a `TrustStore` encodes them; "" for those with which the
+            server started.
+        banned: Robots whose handshakes are rejected, each with the number of seconds.
     """
 
     index: int
@@ -94,7 +96,7 @@ class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
 
 
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
-    """Wait at most *held_s* until the commands that are held are answered, close every socket, and exit."""
+    """Wait at most *held_s* seconds until all commands are answered, close every socket, and exit."""
 
     held_s: float
 
@@ -118,10 +120,10 @@ _DECODER: msgspec.json.Decoder[WorkerOrder] = msgspec.json.Decoder(WorkerOrder)
 
 
 def encode_order(order: WorkerOrder) -> bytes:
-    """Return the line that carries *order*."""
+    """Return *order* as a line of JSON, with a newline."""
     return msgspec.json.encode(order) + b"\n"
 
 
 def decode_order(line: bytes) -> WorkerOrder:
-    """Return the order in *line*; raises msgspec.ValidationError if there is none."""
+    """Return the order in *line*; raises msgspec.ValidationError if *line* is no order."""
     return _DECODER.decode(line)

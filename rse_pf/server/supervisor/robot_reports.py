@@ -1,7 +1,7 @@
 """Report robots from a worker to its supervisor: events of single robots, and a list for operators.
 
-To wake the supervisor costs more CPU time than to handle an event, so several events are sent in one message.
-Their order is kept, and none is lost.  A row of the list has no payload, no token and no address.
+Waking the supervisor costs more CPU time than handling an event, so the events of `_GATHER_S` are sent in one
+message, in their order.  A row of the list contains no payload, no token and no address.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from rse_pf.server.gateway.connection import RobotConnection
 
 __all__ = ["MAX_ROBOT_ROWS", "RobotEvents", "robot_rows"]
 
-MAX_ROBOT_ROWS = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
-_GATHER_S = 0.01  # an event waits this long for others
-_MAX_EVENTS = 500  # in one message, so that it stays below the 1 MiB that a line of the channel may have
+MAX_ROBOT_ROWS = 500  # rows of robots in one message to the supervisor, which may have 1 MiB
+_GATHER_S = 0.01  # seconds for which an event waits for others that are sent in the same message
+_MAX_EVENTS = 500  # events in one message to the supervisor, which may have 1 MiB
 
 
 class RobotEvents:
-    """The events of the robots of one worker that wait to be sent."""
+    """Collects the events of one worker's robots, and sends them to the supervisor in batches."""
 
     def __init__(self, loop: AbstractEventLoop, send: Callable[..., None]) -> None:
-        """Hold no event yet; *send* sends a message to the supervisor."""
+        """Hold no event yet; *send* sends its keyword arguments as a message to the supervisor."""
         self._loop = loop
         self._send = send
         self._held: list[dict[str, Any]] = []
 
     def add(self, **event: Any) -> None:
-        """Send *event* together with those that follow within `_GATHER_S`."""
+        """Send *event* within `_GATHER_S`, in one message with the events that are added until then."""
         if not self._held:
             self._loop.call_later(_GATHER_S, self.flush)
         self._held.append(event)
@@ -42,11 +42,11 @@ class RobotEvents:
 
 
 def robot_rows(connections: Iterable[RobotConnection], now: float) -> list[dict[str, Any]]:
-    """Return a row for each robot that an operator sees, by tenant and name, as plain JSON values.
+    """Return a row for each robot that has sent its Hello and is not synthetic, sorted by tenant and name.
 
     Args:
-        connections: The connections of the worker.
-        now: Monotonic seconds; ``connected_s`` is the age of the connection at that time.
+        connections: The connections of the worker; those that are closing are left out.
+        now: Present time, monotonic seconds; the field ``connected_s`` is the age of the connection.
     """
     rows = [
         {

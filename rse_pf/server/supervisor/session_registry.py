@@ -1,8 +1,10 @@
-"""Register the robots that are connected to one server; the newer connection of a robot replaces the older.
+"""Register the robots that are connected to one server, and close older connections of the same robot.
 
-Connections are ordered by the acceptance of their sockets, however late a worker reads the Hello.  A robot
-that was asked to move keeps its old connection until its time to move is over; the worker then reports
-``stays``.
+1. A worker reports ``arrived`` when a robot has sent its Hello, and ``left`` when the connection is closed.
+2. On ``arrived``, all connections of the robot but the newest are closed.  The newest is the one whose socket
+   was accepted last, however late its worker reads the Hello.
+3. The worker keeps a connection that was asked to move until its time to move is over, and then reports
+   ``stays``.  If it is still not the newest, it is closed then.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ __all__ = ["SessionRegistry"]
 
 
 class SessionRegistry:
-    """The socket numbers of every robot that is connected to one server, with the worker of each."""
+    """The socket numbers of each robot that is connected to one server, and the worker of each socket."""
 
     def __init__(self) -> None:
         self._sockets: dict[RobotId, dict[int, WorkerProcess]] = {}
@@ -27,11 +29,11 @@ class SessionRegistry:
         return len(self._sockets)
 
     def robot_of(self, number: int) -> RobotId | None:
-        """Return the robot of the connection *number*, None if it is not registered."""
+        """Return the robot of the connection *number*, None if the connection is not registered."""
         return next((robot for robot, sockets in self._sockets.items() if number in sockets), None)
 
     def forget(self, worker: WorkerProcess) -> None:
-        """Forget the connections of *worker*, which has ended."""
+        """Forget all connections of *worker*, which has exited."""
         for robot, sockets in list(self._sockets.items()):
             left = {number: other for number, other in sockets.items() if other is not worker}
             if left:
@@ -40,7 +42,10 @@ class SessionRegistry:
                 del self._sockets[robot]
 
     def handle(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
-        """Handle the event of one socket that *worker* reports: ``arrived``, ``stays`` or ``left``."""
+        """Handle the event ``arrived``, ``stays`` or ``left`` of one socket, which *worker* reports.
+
+        Older connections are closed by a `ReplaceOrder` to their workers.
+        """
         robot, number, event = RobotId(*message["robot"]), message["number"], message["event"]
         sockets = self._sockets.setdefault(robot, {})
         if event == "arrived":

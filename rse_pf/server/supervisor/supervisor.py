@@ -1,9 +1,9 @@
 """One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
 
-The supervisor accepts the sockets of robots, and passes each one that has begun to send to the worker with
-the fewest robots.  It reads no byte of a robot.  A worker that crashed in native code is replaced
-(`crash_recovery`).  If a worker ends in another way, the server exits, and the scale modifier replaces it.  A
-drain loses no command.
+The supervisor accepts the sockets of robots, and passes each socket that has begun to send to the worker with
+the fewest sockets.  It does not read what robots send.  A worker that crashed in native code is replaced
+(`crash_recovery`).  If a worker exits in another way, the server exits, and the scale modifier replaces the
+server.  A drain loses no command.
 """
 
 from __future__ import annotations
@@ -62,18 +62,18 @@ from rse_pf.version import installed_version
 
 __all__ = ["serve"]
 
-_FRESH_S = 0.25  # reports of the workers are reused for this long, so that several readers cost one report
-_REPORT_S = 0.3  # a worker that does not report within this keeps its last report
-_ROWS_S = 2.0  # a worker that does not answer within this is counted as silent in the answer to the operator
-_LEAVE_S = 3.0  # workers have this long to close their sockets; then they are killed
-_MAX_MOVES = 10000  # robots of one migration: as many connections as one server has
-_MAX_BLOCKS = 2000  # rows in one answer of the control port
-_MAX_ROBOTS = 1000  # rows in one answer of the control port
-_MAX_SPREAD_S = 3600.0  # longest migration that an operator may ask for
-_MAX_DRAIN_WAIT_S = 3600.0  # longest wait before a drain that an operator may ask for
-_EXIT_OK = 0
-_EXIT_LOST = 1
-_PUBLIC_PAGES = ("/healthz", "/readyz")  # load balancers request them without a token
+_FRESH_S = 0.25  # seconds for which reports of the workers are reused: several readers then cost one report
+_REPORT_S = 0.3  # seconds to wait for a worker's report; after that, its last report is used
+_ROWS_S = 2.0  # seconds to wait for a worker's rows; after that, the answer counts the worker as silent
+_LEAVE_S = 3.0  # seconds, after held commands, in which workers must exit; then they are killed
+_MAX_MOVES = 10000  # robots of one migration: the default of ``serving.max_robots``
+_MAX_BLOCKS = 2000  # rows in one answer of /blocks and /unblock
+_MAX_ROBOTS = 1000  # rows in one answer of /robots
+_MAX_SPREAD_S = 3600.0  # longest duration of a migration, in seconds, that /move accepts
+_MAX_DRAIN_WAIT_S = 3600.0  # longest wait before robots are asked to move, in seconds, that /drain accepts
+_EXIT_OK = 0  # exit code after a drain or a signal
+_EXIT_LOST = 1  # exit code after a worker was lost, or did not start in time
+_PUBLIC_PAGES = ("/healthz", "/readyz")  # pages without a token: load balancers request them
 
 
 def serve(
@@ -96,20 +96,22 @@ def serve(
         settings: The settings that all servers of the platform share; /healthz shows their digest.
         placement: Addresses, workers and store of this server; None takes those of *settings*.
         keys: Public keys of robots' tokens, for the whole run; None only where ``auth.required`` is false.
-        trust: Reads public keys, roster and deny list, now and periodically, instead of *keys*.
+        trust: Reads public keys, roster and deny list, now and periodically; then *keys* is not used.
         server_id: Name of this server in every Welcome, Result and log line.
-        announce: File for pids and ports, as JSON; written once everything listens.
-        conformance_echo: Echo raw messages without token or sub-protocol, for conformance suites.
+        announce: File for process ids and ports, as JSON; written when all workers are ready, and deleted at
+            the exit.
+        conformance_echo: Echo all messages without token or sub-protocol, for WebSocket conformance suites.
         services: ``module:function`` that makes the registry of a worker from the settings.
         audit: Folder of the audit log; None records nothing.
         control_token: Token that the control port requires for all but its two health pages; None: no token.
-        recorder: Records what robots and this server send; None records nothing.
+        recorder: Records the messages of robots and of this server; None records nothing.
 
     Returns:
-        0 after a drain or a signal, 1 when a worker was lost.
+        0 after a drain or a signal; 1 if a worker was lost, or did not start in time.
 
     Raises:
-        ConfigurationError: No keys, no authentication on a public address, or the port is taken.
+        ConfigurationError: There are no keys, robots could connect from other machines without a token, or
+            the port is taken.
     """
     if trust is not None:
         trust.load()
@@ -161,7 +163,7 @@ def serve(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Identity:
-    """Id of a server, digest of its settings, file of its announcement, and token of its control port."""
+    """Name of a server, digest of its settings, and *announce* and *control_token* of `serve`."""
 
     server_id: str
     digest: str
@@ -171,7 +173,7 @@ class _Identity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Processes:
-    """The processes of a server: workers, spare workers that wait for a crash, and ids of others."""
+    """The processes of a server: workers, spare processes that replace crashed workers, and ids of others."""
 
     workers: list[WorkerProcess]
     spares: list[WorkerProcess]
@@ -283,45 +285,47 @@ class _Supervisor:
             "workers": [worker.pid for worker in self._workers],
         }
 
-    # --- robots --------------------------------------------------------------------------------
-
     def _pass_on(self, fd: int, number: int, peer: str) -> None:
-        """Send an accepted socket to the worker with the fewest robots whose channel has room."""
+        """Send an accepted socket to the worker with the fewest sockets; if its channel is full, to another.
+
+        If the channels of all workers are full, the socket is refused.
+        """
         if min(self._workers, key=_load_of).give(fd, number, peer):
             return
-        for worker in sorted(self._workers, key=_load_of)[1:]:  # the channel of the first one is full
+        for worker in sorted(self._workers, key=_load_of)[1:]:  # the channel of the first worker is full
             if worker.give(fd, number, peer):
                 return
         self._refused_full += 1
 
     def _on_message(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
-        """Handle what a worker reports: notes for the audit log, or an event of one robot."""
+        """Handle a message of a worker: notes for the audit log, or an event of one robot's connection."""
         if message["event"] == "audit":
             self._records.add(message["notes"])
         else:
             self._registry.handle(worker, message)
 
-    # --- the end -------------------------------------------------------------------------------
-
     def _on_lost(self, worker: WorkerProcess) -> None:
+        """Replace a worker that crashed; after any other exit of a worker, exit, unless the server leaves."""
         serves = self._state in ("ready", "draining")
-        heir = self._crashes.replace(worker, time.monotonic()) if serves else None
-        if heir is not None:
-            self._keep(self._succeed(heir))
+        replacement = self._crashes.replace(worker, time.monotonic()) if serves else None
+        if replacement is not None:
+            self._keep(self._connect_replacement(replacement))
             if self._announce is not None:
                 replace_json(self._announce, self._identity())
         elif self._state != "leaving":
             self._log.error("worker-lost", pid=worker.pid, exit_code=worker.exit_code())
             self._finish(_EXIT_LOST)
 
-    async def _succeed(self, heir: WorkerProcess) -> None:
-        await heir.connect(on_lost=self._on_lost, on_message=self._on_message)
+    async def _connect_replacement(self, worker: WorkerProcess) -> None:
+        """Wait until *worker*, which replaces a crashed one, is ready; send it the order of a drain, if any."""
+        await worker.connect(on_lost=self._on_lost, on_message=self._on_message)
         if self._state == "draining":
-            heir.order(DrainOrder(MOVE_WITHIN_MS))
+            worker.order(DrainOrder(MOVE_WITHIN_MS))
         elif self._state == "leaving":
-            heir.order(LeaveOrder(0.0))
+            worker.order(LeaveOrder(0.0))
 
     def _on_signal(self, number: signal.Signals) -> None:
+        """Drain the server at SIGTERM; exit at once at SIGINT, at a second signal, or during the start."""
         self._signals += 1
         if number == signal.SIGINT or self._signals > 1 or self._state == "starting":
             self._keep(self._leave(held_s=0.0))
@@ -331,9 +335,10 @@ class _Supervisor:
     async def _drain(self, wait_s: float) -> None:
         """Drain the server without losing a command.
 
-        1. Report not ready for *wait_s* seconds, but accept: the load balancer needs this time.
-        2. Ask all robots to move to another server, and wait until they have.
-        3. Answer the commands that are held, close the sockets and exit.
+        1. Report not ready for *wait_s* seconds, but accept robots: the load balancer needs this time to stop
+           sending new ones.
+        2. Ask all robots to move to another server, and wait until they have, at most `MOVE_WITHIN_MS`.
+        3. Answer the received commands, at most for ``session.answer_timeout_s``, close the sockets and exit.
         """
         self._state = "draining"
         self._log.info("drain", wait_s=wait_s)
@@ -346,11 +351,12 @@ class _Supervisor:
         await self._leave(self._settings.session.answer_timeout_s)
 
     async def _wait_empty(self) -> None:
-        """Wait until no worker has a robot, also none that replaced a crashed worker meanwhile."""
+        """Wait until no worker has a robot, including workers that replaced a crashed one meanwhile."""
         while waiting := [worker for worker in self._workers if not worker.empty.is_set()]:
             await waiting[0].empty.wait()
 
     async def _leave(self, held_s: float) -> None:
+        """Order the workers to answer commands for at most *held_s* seconds and exit; then finish with 0."""
         if self._state == "leaving" and held_s > 0:
             return
         self._state = "leaving"
@@ -363,6 +369,7 @@ class _Supervisor:
         self._finish(_EXIT_OK)
 
     def _finish(self, code: int) -> None:
+        """Let `run` return *code*, unless it has a code already."""
         self._state = "leaving"
         if not self._over.done():
             self._over.set_result(code)
@@ -372,9 +379,8 @@ class _Supervisor:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    # --- the control port ------------------------------------------------------------------------
-
     async def _answer(self, ask: ControlRequest) -> ControlReply:
+        """Answer one request to the control port, after its token was checked."""
         pages: dict[tuple[str, str], Callable[[ControlRequest], Awaitable[ControlReply]]] = {
             ("GET", "/healthz"): self._healthz,
             ("GET", "/readyz"): self._readyz,
@@ -476,11 +482,11 @@ class _Supervisor:
         return json_reply(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
 
     async def _robots(self, ask: ControlRequest) -> ControlReply:
-        """Return at most `_MAX_ROBOTS` connected robots; ``count`` is the number of all."""
+        """Return rows for at most `_MAX_ROBOTS` connected robots; ``count`` is the number of all of them."""
         return json_reply(await self._ask_rows("robots", RobotsOrder, _MAX_ROBOTS))
 
     async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
-        """Lift refusals after crashes: all, or those of a service, a tenant, or a robot of a tenant."""
+        """Lift refusals after crashes: those that the query selects by service, tenant and robot, or all."""
         scope = {name: ask.query.get(name) for name in ("service", "tenant", "robot")}
         if not ask.is_local:
             return refused_reply(403, "forbidden", "unblock from the server's own machine")
@@ -494,7 +500,11 @@ class _Supervisor:
         return json_reply(answer)
 
     async def _ask_rows(self, key: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
-        """Return the rows of all workers under *key*; a row that several workers report is repeated."""
+        """Send an order to all workers, and return their rows, at most *most*, under the name *key*.
+
+        A row that several workers report is repeated.  ``count`` is the number of all rows, and
+        ``silent_workers`` the number of workers without an answer within `_ROWS_S`.
+        """
         async with self._asking_rows:
             self._asked_rows += 1
             order = make_order(self._asked_rows)
@@ -510,7 +520,7 @@ class _Supervisor:
         }
 
     async def _post_services(self, ask: ControlRequest) -> ControlReply:
-        """Load the services folder again; /status shows the services that every worker runs."""
+        """Order the workers to load the services folder again; later /status shows what every worker runs."""
         if not (ask.is_local and self._settings.services.follow):
             return refused_reply(403, "forbidden", "only here, and with --follow-services")
         for worker in self._workers:
@@ -531,7 +541,7 @@ class _Supervisor:
         return json_reply({"state": self._state}, status=202)
 
     async def _post_move(self, ask: ControlRequest) -> ControlReply:
-        """Ask robots to move, unless an earlier migration still runs."""
+        """Begin a migration of as many robots as the query says, unless an earlier migration still runs."""
         try:
             robots = int(ask.query["robots"])
             spread_s = number_of(ask, "spread_s", 0.0, _MAX_SPREAD_S)
@@ -553,8 +563,10 @@ class _Supervisor:
         return json_reply({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
 
     def _migrate(self, robots: int, spread_s: float) -> tuple[int, float]:
-        """Order the workers to ask *robots* to move; return how many are asked, and within how many
-        seconds."""
+        """Order the workers to ask as many as *robots* to move to another server, within *spread_s* or more.
+
+        Return how many robots are asked, and the seconds until the last of them is asked.
+        """
         delays = plan(
             [worker.load for worker in self._workers], robots, spread_s=spread_s,
             moves_per_s=MOVES_PER_S, random=random.random,
@@ -570,7 +582,10 @@ class _Supervisor:
         return asked, round(last_s, 3)
 
     async def _merge_reports(self) -> dict[str, Any]:
-        """Return the sum of the workers' reports, which are at most `_FRESH_S` old if the workers answer."""
+        """Return the sum of the workers' reports, with the counts of the supervisor added.
+
+        Reports are at most `_FRESH_S` old; of a worker that does not answer in time, the last report counts.
+        """
         async with self._reporting:
             if time.monotonic() - self._reported >= _FRESH_S:
                 await asyncio.gather(*(worker.ask_report(_REPORT_S) for worker in self._workers))
@@ -581,10 +596,14 @@ class _Supervisor:
         return merged
 
     def _cpu_s(self, gauges: Mapping[str, float]) -> float:
-        """Return the CPU seconds of the server's processes; workers report those of limited processes."""
+        """Return the CPU seconds of all processes of the server since its start, crashed workers included.
+
+        *gauges* has those of limited processes, which the workers report.
+        """
         running_s = sum(map(cpu_seconds, self._processes.pids())) + gauges.get("compute_cpu_s", 0.0)
         return round(running_s + self._crashes.cpu_s, 3)
 
 
 def _load_of(worker: WorkerProcess) -> tuple[bool, int]:
+    """Return a sort key: workers that are ready come first, then those with fewer sockets."""
     return not worker.is_ready, worker.load

@@ -1,6 +1,6 @@
 """Read keys, roster and deny list periodically, and send changes to every worker.
 
-After a failed read the last known state stays in force, and the problem is logged once.
+After a failed read, workers continue with what was read last, and the problem is logged once.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ __all__ = ["poll_trust", "update_workers"]
 
 
 async def poll_trust(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
-    """Call `update_workers` periodically until cancelled."""
+    """Call `update_workers` every `REFRESH_S` seconds until this task is cancelled."""
     while True:
         await asyncio.sleep(REFRESH_S)
         await update_workers(trust, workers, log)
 
 
 async def update_workers(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
-    """Read the store in a thread, log a new problem, and send a change to the workers."""
+    """Read *trust* again in a thread; log a new problem, or send what has changed to all *workers*."""
     known = trust.problem
     is_new = await asyncio.to_thread(trust.refresh)
     if trust.problem not in ("", known):

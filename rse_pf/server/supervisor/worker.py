@@ -1,8 +1,8 @@
 """One worker process, forked by the supervisor (`worker_handle`).
 
-Accepted sockets arrive as descriptors on the data channel, orders (`orders`) on the control channel.  A
-worker exits with its supervisor, by the parent-death signal and at the end of its control channel.  It
-ignores the signals of a terminal or a service manager, which are for the supervisor.
+Accepted sockets arrive as descriptors on the data channel, and orders (`orders`) on the control channel.  A
+worker exits when its supervisor exits: by the parent-death signal, or when its control channel is closed.  It
+ignores SIGINT and SIGTERM, which a terminal or a service manager also sends to the supervisor.
 """
 
 from __future__ import annotations
@@ -81,23 +81,39 @@ from rse_pf.wire.server_session import CLOSE_RATE
 __all__ = ["BEGIN_LENGTH", "HANDOVER", "WorkerPlan", "repeat_for", "run_worker"]
 
 HANDOVER = struct.Struct("!Q46s")
-"""The number of a socket and the address of its peer, sent together with its descriptor."""
+"""A message on the data channel: number of a socket and address of its peer, sent with its descriptor."""
 BEGIN_LENGTH = struct.Struct("!I")
-"""Length in bytes of the `BeginOrder` that follows it on the control channel of a spare process."""
+"""The first bytes on the control channel of a spare process: the length of the `BeginOrder` behind them."""
 _DESCRIPTOR = struct.Struct("@i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_DESCRIPTOR.size)
 _T = TypeVar("_T")
-_TAKE_S = 0.0005  # for new sockets in one round of the event loop, so that robots are served in between
-_POLL_S = 0.01  # between two looks whether all connections or commands have ended
-_GATHER_S = 0.01  # ended sockets are reported together: each message wakes the supervisor
-_MAX_LINE_BYTES = 1 << 26  # longest order: a `TrustOrder` names every enrolled robot
-_CLOSE_TIMEOUT_S = 1.0  # for closing live maps, and then connections, when the worker exits
+_TAKE_S = 0.0005  # seconds for new sockets in one round of the event loop, so that robots are served, too
+_POLL_S = 0.01  # seconds between two checks whether all connections are closed, or all commands answered
+_GATHER_S = 0.01  # seconds in which closed sockets are reported together: each message wakes the supervisor
+_MAX_LINE_BYTES = 1 << 26  # bytes of the longest order: a `TrustOrder` contains every enrolled robot
+_CLOSE_TIMEOUT_S = 1.0  # seconds for closing live maps, and as many for connections, when the worker exits
 _MAX_BLOCKS = 500  # rows of refusals in one message to the supervisor: an operator reads no more
 
 
 @dataclass(frozen=True)
 class WorkerPlan:
-    """What a worker gets when it is forked; it verifies tokens by ``keys`` until the first `TrustOrder`."""
+    """The values with which a worker is forked.
+
+    Attributes:
+        settings: The settings of the server.
+        keys: Verify tokens until the first `TrustOrder`; None if no tokens are required.
+        server_id: Name of the server.
+        services: The ``module:function`` that returns the registry of services.
+        workers: Number of workers of the server; each has its part of the server's limits.
+        index: Index of this worker, from 0; -1 for a spare process.
+        job_slots: Descriptor of the file of `make_slot_file`.
+        supervisor: Process id of the supervisor.
+        conformance_echo: Whether messages are echoed, for conformance suites.
+        audit: Whether the server has an audit log.
+        crash: Shared memory for the report of a crash in native code.
+        is_spare: Whether the process waits for a `BeginOrder`, which gives it the index of a crashed worker.
+        recorder: Records messages.
+    """
 
     settings: PlatformSettings
     keys: KeySet | None
@@ -110,21 +126,22 @@ class WorkerPlan:
     conformance_echo: bool = False
     audit: bool = False
     crash: CrashReport = field(default_factory=CrashReport)
-    """What is left when native code ends it."""
     is_spare: bool = False
-    """Whether it waits for a `BeginOrder`, which gives it the index of a worker that crashed."""
     recorder: ServerRecorder = field(default_factory=NullServerRecorder)
 
 
 def repeat_for(seconds: float, step: Callable[[], bool], clock: Callable[[], float]) -> None:
-    """Call *step* once, and again until it returns False or *seconds* have passed."""
+    """Call *step* at least once, and again until it returns False or *seconds* have passed by *clock*."""
     until = clock() + seconds
     while step() and clock() < until:
         pass
 
 
 def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) -> None:
-    """Serve robots until a `LeaveOrder`, or until the supervisor has exited."""
+    """Serve robots until a `LeaveOrder`, or until the supervisor exits; the main function of a worker.
+
+    A spare process first waits for its `BeginOrder`.  *data* and *control* are the worker's channels.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if not die_with_parent(plan.supervisor):
@@ -150,7 +167,7 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
 
 
 def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
-    """Wait for the order that starts a spare process and return it; None if the supervisor has exited."""
+    """Wait for the order by which a spare process replaces a worker; None if the supervisor has exited."""
     head = receive_bytes(control, BEGIN_LENGTH.size)
     size = BEGIN_LENGTH.unpack(head)[0] if len(head) == BEGIN_LENGTH.size else 0
     line = receive_bytes(control, size)
@@ -159,7 +176,7 @@ def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
 
 
 def _plan_of(plan: WorkerPlan, order: BeginOrder) -> WorkerPlan:
-    """Return the plan of a spare process that takes the place of a worker."""
+    """Return the plan of a spare process, with the index and the keys of *order*."""
     keys = key_set_from_snapshot(order.snapshot) if order.snapshot and plan.keys is not None else plan.keys
     return replace(plan, index=order.index, keys=keys)
 
@@ -250,7 +267,11 @@ class _Worker:
         )
 
     def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:
-        """Return the installed services; if ``services.follow`` is set, a damaged folder counts as empty."""
+        """Return the services of the services folder and of published packages.
+
+        If ``services.follow`` is set, the error of a damaged folder is logged, and the folder counts as
+        empty.
+        """
         published = packaged_services() if chosen.published else []
         if not chosen.folder:
             return published
@@ -300,14 +321,18 @@ class _Worker:
         return reloading
 
     def _offer(self, names: tuple[str, ...]) -> None:
-        """Offer the installed services *names* from now on."""
+        """Set the names of installed services in the registry and in answers to *names*."""
         self._registry.others = names
         self._answers.offer(
             frozenset((*names, *(service.name for service in self._registry))) | LIVE_SERVICES
         )
 
     async def _reload_services(self) -> None:
-        """Load the services folder again, which may take seconds: every file is compared with its digest."""
+        """Load the services folder again in a thread, and replace the installed services.
+
+        This may take seconds, since every file is compared with its digest.  If it fails, the error is logged
+        and the present services stay.
+        """
         chosen = self._dispatcher.context.settings.services
         if self._sandboxes is None or not chosen.follow:
             return
@@ -338,6 +363,7 @@ class _Worker:
         )  # fmt: skip
 
     async def run(self) -> None:
+        """Obey orders until a `LeaveOrder` or the end of the control channel, then exit the process."""
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
         self._data.setblocking(False)
         self._loop.add_reader(self._data.fileno(), self._take_sockets)
@@ -385,9 +411,9 @@ class _Worker:
                 self._keep(self._reload_services())
 
     def ban(self, robot: RobotId, seconds: float) -> None:
-        """Disconnect *robot*, and refuse it for *seconds*."""
+        """Close all connections of *robot*, and reject its handshakes for *seconds*."""
         self._dispatcher.rates.ban(robot, time.monotonic(), seconds)
-        for connection in [each for each in self._dispatcher.connections if each.robot == robot]:
+        for connection in [live for live in self._dispatcher.connections if live.robot == robot]:
             connection.close(CLOSE_RATE, "crashes")
 
     def _report(self) -> dict[str, Any]:
@@ -407,6 +433,7 @@ class _Worker:
         self._send(event="empty")
 
     async def _leave(self, held_s: float) -> None:
+        """Wait at most *held_s* until all commands are answered, then close all connections and live maps."""
         until = time.monotonic() + held_s
         while self._dispatcher.held and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
@@ -422,7 +449,7 @@ class _Worker:
         repeat_for(_TAKE_S, self._take_socket, time.monotonic)
 
     def _take_socket(self) -> bool:
-        """Take one socket from the supervisor; return whether there may be more."""
+        """Receive one socket from the supervisor; return False if there is none, or if handshakes wait."""
         try:
             message, ancillary, _, _ = self._data.recvmsg(HANDOVER.size, _ANCILLARY_BYTES)
         except BlockingIOError:
@@ -443,8 +470,7 @@ class _Worker:
             self._loop.call_later(_GATHER_S, self._flush_ends)
 
     def _flush_ends(self) -> None:
-        """Send the supervisor one byte for each socket that ended, so that it can count this worker's
-        load."""
+        """Send the supervisor one byte for each closed socket, from which it computes this worker's load."""
         self._flushing = False
         try:
             self._ended -= self._data.send(b"e" * self._ended)
@@ -455,6 +481,7 @@ class _Worker:
             self._ended = 0  # the supervisor has exited; the control channel ends this process
 
     def _new_name(self) -> str:
+        """Return a name for a robot without a token, unique among the workers of the server."""
         self._named += 1
         return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
 
@@ -462,6 +489,7 @@ class _Worker:
         self._writer.write(msgspec.json.encode(message) + b"\n")
 
     def _keep(self, work: Any) -> None:
+        """Run the coroutine *work* as a task, and hold a reference to the task until it is done."""
         task = self._loop.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

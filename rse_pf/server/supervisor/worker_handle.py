@@ -1,8 +1,9 @@
-"""Control a worker from its supervisor: a process, its load, and two channels.
+"""Fork the workers of a server, and control them from the supervisor by two channels each.
 
-Workers are forked after the supervisor's imports, which take most of the time of a start, and before its
-event loop and its threads.  A worker holds neither another worker's channels nor the listener.  No call
-here blocks the supervisor: a full channel is a refusal, a worker that does not answer a timeout.
+Sockets are sent on the data channel, and orders on the control channel.  Workers are forked after the
+supervisor's imports, which take most of the time of a start, and before its event loop and its threads.  A
+worker inherits neither the listener nor the channels of other workers.  Calls do not block the supervisor: a
+socket is refused if the channel is full, and waiting for an answer has a timeout.
 """
 
 from __future__ import annotations
@@ -39,19 +40,19 @@ from rse_pf.services.loading import load_services
 __all__ = ["BUILTIN", "RowsOrder", "WorkerProcess", "fork_workers", "warm_up"]
 
 RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder
-"""Orders that a worker answers with rows."""
+"""Orders that a worker answers with a list of rows for an operator."""
 BUILTIN = "rse_pf.services.builtin:builtin_services"
-"""The platform's own services."""
+"""The ``module:function`` that returns the registry of the platform's own services."""
 _DESCRIPTOR = struct.Struct("@i")
-_MAX_LINE_BYTES = 1 << 20
-_READ_BYTES = 4096
+_MAX_LINE_BYTES = 1 << 20  # bytes of the longest message of a worker
+_READ_BYTES = 4096  # bytes read at a time, each of which reports a closed socket
 
 
 def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -> None:
-    """Import what every worker needs: most of the time of a server's start.
+    """Import the modules that every worker needs, and load *services* once; most of a server's start time.
 
     Raises:
-        ConfigurationError: There are no such services.
+        ConfigurationError: The services cannot be loaded.
         MissingExtra: The extra ``backend`` is not installed.
     """
     event_loop_maker()
@@ -63,15 +64,18 @@ def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -
 
 
 def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> list[WorkerProcess]:
-    """Import what every worker needs, then fork one for each plan; call this before any thread or loop.
+    """Import the modules that every worker needs, then fork a worker for each plan, and return the workers.
+
+    Call this before any thread is started and any event loop is made.  A worker closes its copy of
+    *listener*.
 
     Raises:
-        ConfigurationError: There are no such services.
+        ConfigurationError: The services cannot be loaded.
         MissingExtra: The extra ``backend`` is not installed.
     """
     warm_up(plans[0].services, plans[0].settings)
     gc.collect()
-    gc.freeze()  # or the first collection of a worker would copy every page that it shares
+    gc.freeze()  # otherwise the first garbage collection of a worker would copy every shared memory page
     workers: list[WorkerProcess] = []
     try:
         for plan in plans:
@@ -85,18 +89,25 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
 
 
 class WorkerProcess:
-    """One worker process: `start` forks it, and `connect` waits until it takes sockets.
+    """A worker process as its supervisor sees it: `start` forks it, `connect` waits until it is ready.
 
-    ``channels`` are the supervisor's ends of both channels, ``pid`` is the process id.
+    Attributes:
+        channels: The supervisor's ends of the data channel and the control channel.
+        pid: The process id.
+        load: Number of sockets that were sent to the worker and are not closed.
+        is_ready: Whether the worker accepts sockets.
+        report: The last report of its metrics; None before the first.
+        empty: Set when a draining worker has no robot any more, or the worker has exited.
+        gone: Set when the worker has exited.
     """
 
     def __init__(self, plan: WorkerPlan) -> None:
-        """Describe the process."""
+        """Fork nothing yet."""
         self._plan = plan
         self.load = 0
         self.is_ready = False
         self.cpu_s = 0.0
-        """CPU seconds of the process, known after it has ended."""
+        """CPU seconds of the process; 0 until its exit code was read."""
         self.crash = plan.crash
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
@@ -109,9 +120,9 @@ class WorkerProcess:
         self._rows_number = 0
 
     def start(self, *, unshared: Sequence[socket.socket]) -> WorkerProcess:
-        """Fork the process, and return this object.
+        """Fork the process, and return this object in the parent; the child never returns.
 
-        The child closes *unshared*: the sockets of its parent that it must not hold.
+        The child closes the sockets *unshared*, which belong to its parent only.
         """
         self._data, data = socket.socketpair()
         self._control, control = socket.socketpair()
@@ -133,13 +144,13 @@ class WorkerProcess:
                 pid, status, used = os.wait4(self.pid, how)
                 self.cpu_s = used.ru_utime + used.ru_stime
             except ChildProcessError:
-                pid, status = self.pid, 0  # somebody else reaped it
+                pid, status = self.pid, 0  # other code has reaped the process, so its exit code is unknown
             if pid:
                 self._exit_code = os.waitstatus_to_exitcode(status)
         return self._exit_code
 
     def begin(self, order: BeginOrder) -> bool:
-        """Let a spare process take the place of a worker, before `connect`; return False if it has ended."""
+        """Send *order* to a spare process, before `connect`; return False if the process has exited."""
         data = encode_order(order)
         try:
             self._control.sendall(BEGIN_LENGTH.pack(len(data)) + data)
@@ -153,11 +164,11 @@ class WorkerProcess:
         on_lost: Callable[[WorkerProcess], None],
         on_message: Callable[[WorkerProcess, dict[str, Any]], None],
     ) -> None:
-        """Wait until the worker takes sockets.
+        """Connect to the control channel, and wait until the worker is ready for sockets.
 
         Args:
-            on_lost: Called if the worker ends, before that or later.
-            on_message: Called with each event of a robot, and with notes for the audit log.
+            on_lost: Called when the worker exits, also if it was never ready.
+            on_message: Called with each event of a robot, and with each message of notes for the audit log.
         """
         self._on_lost, self._on_message = on_lost, on_message
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
@@ -169,10 +180,15 @@ class WorkerProcess:
         loop.add_reader(self._data.fileno(), self._count_ended)
 
     def give(self, fd: int, number: int, peer: str) -> bool:
-        """Send the worker the *number*-th accepted socket, which comes from the address *peer*.
+        """Send an accepted socket to the worker.
+
+        Args:
+            fd: Descriptor of the socket, which stays open in this process.
+            number: Number of the socket on this server, in the order of acceptance.
+            peer: Address of the other end.
 
         Returns:
-            False if its channel is full or closed.  The descriptor *fd* stays open in both cases.
+            True if the socket was sent; False if the channel is full or closed.
         """
         try:
             self._data.sendmsg(
@@ -185,18 +201,21 @@ class WorkerProcess:
         return True
 
     def order(self, order: WorkerOrder) -> None:
-        """Send *order*; it is lost if the worker has exited."""
+        """Send *order* to the worker; the order is lost if the worker has exited."""
         if self._writer is not None and not self._writer.is_closing():
             self._writer.write(encode_order(order))
 
     async def ask_report(self, timeout_s: float) -> None:
-        """Update `report`, or leave it as it is when the worker does not answer in time."""
+        """Ask the worker for its metrics, and set ``report``; without an answer in time it stays as it is."""
         self._reported = asyncio.get_running_loop().create_future()
         self.order(ReportOrder())
         await asyncio.wait([self._reported], timeout=timeout_s)
 
     async def ask_rows(self, order: RowsOrder, timeout_s: float) -> dict[str, Any] | None:
-        """Return the worker's answer to *order*, None if there is none in time; one order at a time."""
+        """Send *order* and return the worker's answer; None if no answer comes within *timeout_s*.
+
+        There may be only one such call at a time.
+        """
         self._rows = asyncio.get_running_loop().create_future()
         self._rows_number = order.number
         self.order(order)
@@ -221,11 +240,12 @@ class WorkerProcess:
             self._control.close()
 
     async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
+        """Handle the messages of the worker until its exit, then call ``on_lost``."""
         try:
             while line := await reader.readline():
                 self._handle(msgspec.json.decode(line), ready)
         except OSError:
-            pass  # a killed worker resets its channel: the same end as below
+            pass  # a killed worker resets its channel, which is handled as the end of the channel
         self.gone.set()
         self.empty.set()
         self._on_lost(self)
@@ -251,6 +271,7 @@ class WorkerProcess:
                 self._on_message(self, message)
 
     def _count_ended(self) -> None:
+        """Reduce the load by the sockets that the worker reports as closed, one byte each."""
         try:
             ended = self._data.recv(_READ_BYTES)
         except OSError:
@@ -264,7 +285,7 @@ class WorkerProcess:
 def _be_worker(
     plan: WorkerPlan, data: socket.socket, control: socket.socket, unshared: Sequence[socket.socket]
 ) -> NoReturn:
-    """Run the child until it exits, so that it never returns into the code of the supervisor."""
+    """Run a worker in the forked child, and exit, so that the child never runs the supervisor's code."""
     try:
         for inherited in unshared:
             inherited.close()
@@ -273,7 +294,7 @@ def _be_worker(
         os.close(nothing)
         run_worker(plan, data, control)
         os._exit(0)
-    except BaseException:  # noqa: BLE001  it must not go on as a second supervisor
+    except BaseException:  # noqa: BLE001  the child must not continue as a second supervisor
         traceback.print_exc()
         sys.stderr.flush()
     finally:
