@@ -108,6 +108,7 @@ class JsonLog:
             self._wake.set()
 
     def _write_on(self) -> None:
+        """Write the queued lines, in the writer thread, until the log is closed and no line is left."""
         pause = threading.Event()
         while not (self._over and not self._lines):
             self._wake.wait()

@@ -55,7 +55,7 @@ GAUGE_HELP = {
     "recording_dropped": "messages that were not recorded because the recorder was too slow or has ended",
     "ready": "whether the server accepts robots: 1, or 0 while it starts or drains",
     "accept_pauses": "pauses because sockets began to send faster than max_accepts_per_s",
-    "worker_crashes": "workers that native code ended, and that were replaced, since the start",
+    "worker_crashes": "workers that crashed in native code, and were replaced, since the start",
     "disk_free_percent": "free share of the disk of the server's working folder, in percent",
     "control_refused": "requests to the control port that were refused for lack of its token",
 }

@@ -96,7 +96,7 @@ class LimitedServices:
             if overrun.cpu_s >= _LONG_WORK_S:
                 self._note_crash(queued, overrun.message)
             raise Expired(
-                f"its deadline passed after {(context.clocks.monotonic() - now) * 1e3:.0f} ms of work",
+                f"the deadline passed after {(context.clocks.monotonic() - now) * 1e3:.0f} ms of work",
                 hint="set a longer deadline, or send a smaller map",
             ) from None
         except Crashed as crash:

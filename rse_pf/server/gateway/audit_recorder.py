@@ -96,6 +96,7 @@ class AuditRecorder:
         self._send()
 
     def _may_record(self, reason: str) -> bool:
+        """Return whether a refusal for *reason* gets a note of its own; otherwise only count it."""
         if not self._is_on:
             return False
         may = self._refusals.take(reason, self._clocks.monotonic())
@@ -104,12 +105,14 @@ class AuditRecorder:
         return may
 
     def _sum_up(self) -> None:
+        """Add one note with the numbers of the refusals that were only counted, by reason."""
         self._sum = None
         counted = self._refusals.summary()
         if counted:
             self._note("auth.refused-many", "", **counted)
 
     def _note(self, action: str, subject: str, /, **detail: Value) -> None:
+        """Add a note to the next batch, which is sent within `SYNC_S`."""
         if not self._is_on:
             return
         note = {"time": self._clocks.wall(), "action": action, "subject": subject, "detail": detail}

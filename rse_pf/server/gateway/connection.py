@@ -227,6 +227,7 @@ class RobotConnection:
             self._read_deferred()
 
     def _read_deferred(self) -> None:
+        """Handle the deferred messages in their order, and read from the socket again."""
         if self._deferred is None:
             return
         deferred, self._deferred = self._deferred, None

@@ -259,6 +259,7 @@ class Dispatcher:
     def _decode_in_thread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> None:
+        """Have *data* decoded in the decoder thread, and defer the robot's further messages until then."""
         state, suspicion = session.state, session.suspicion
 
         def follow_decoded(message: FromRobot | ProtocolError) -> None:
@@ -302,6 +303,7 @@ class Dispatcher:
             self._greet(connection, now)
 
     def _execute(self, connection: RobotConnection, decision: Decision, size_bytes: int, now: float) -> None:
+        """Carry out one decision of the session: submit, write, renew, cancel, close or subscribe."""
         match decision:
             case Submit():
                 self.submit(connection, decision.command, size_bytes, now)
@@ -365,7 +367,7 @@ class Dispatcher:
         if self._updates is not None:
             self._updates.subscribe(connection, identity, topic)
         else:
-            error = NotFound("this server offers no updates", hint="the operator has switched live maps off")
+            error = NotFound("this server has no live maps", hint="ask the operator to switch live maps on")
             connection.refuse_updates(identity, error)
 
     def snapshot(self) -> dict[str, Any]:
@@ -398,6 +400,7 @@ class Dispatcher:
         return None
 
     def _tick(self) -> None:
+        """Close idle connections, measure how late the event loop was, and plan the next tick."""
         now = self.context.clocks.monotonic()
         self._lag_s = max(self._lag_s, -self._idle_timeouts.until_tick_s(now))
         self._idle_timeouts.close_idle(self.connections, now)

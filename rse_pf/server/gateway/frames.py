@@ -122,6 +122,7 @@ class FrameAssembler:
         return SendPong(payload) if opcode == PING else None
 
     def _begin(self, opcode: int, fin: bool, payload: bytes) -> FrameDecision | None:
+        """Handle the first frame of a message: pass it on if it is whole, or keep it for further frames."""
         if self._message is not None:
             return self._close(CLOSE_PROTOCOL_ERROR, "a message inside of a message")
         if len(payload) > self._limits.max_message_bytes:
@@ -133,6 +134,7 @@ class FrameAssembler:
         return None
 
     def _continue(self, fin: bool, payload: bytes) -> FrameDecision | None:
+        """Add a continuation frame to the incomplete message; pass the message on if it is whole."""
         if self._message is None:
             return self._close(CLOSE_PROTOCOL_ERROR, "nothing to continue")
         self._count += 1
@@ -148,6 +150,7 @@ class FrameAssembler:
         return self._finish(self._opcode, whole)
 
     def _finish(self, opcode: int, data: bytes) -> FrameDecision:
+        """Return the decision to pass a message on, or to close for text that is not valid UTF-8."""
         if opcode == BINARY:
             return Received(data, False)
         if not data.isascii():
@@ -158,6 +161,7 @@ class FrameAssembler:
         return Received(data, True)
 
     def _answer_close(self, payload: bytes) -> CloseSocket:
+        """Return the decision to answer a CLOSE frame, by its own code if the frame is valid."""
         if not payload:
             return self._close(CLOSE_NORMAL, "")
         code = int.from_bytes(payload[:2], "big")
@@ -170,6 +174,7 @@ class FrameAssembler:
         return self._close(code, "")
 
     def _close(self, code: int, reason: str) -> CloseSocket:
+        """Ignore all further frames, and return the decision to close the socket with *code*."""
         self.closed = True
         self._message = None
         return CloseSocket(code, reason)

@@ -142,6 +142,7 @@ class RequestHead:
         return carried_token(self.text(b"authorization"), self.words(b"sec-websocket-protocol"))
 
     def _read_key(self) -> bytes:
+        """Return the key of a valid upgrade to WebSocket (RFC 6455, 4.2.1), or an empty one."""
         headers = self._headers
         key = headers.get(b"sec-websocket-key", b"")
         options = headers.get(b"connection", b"").lower()
@@ -203,6 +204,7 @@ def _utc(unix_s: float) -> str:
 
 
 def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, str]) -> Rejected:
+    """Return a rejection with the whole HTTP answer, which closes the connection."""
     lines = {**headers, "Content-Length": str(len(body)), "Connection": "close"}
     head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
     answer = f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{head}\r\n".encode() + body

@@ -74,6 +74,7 @@ class Migration:
             self._loop.call_later(delay_s, partial(self._ask, within_ms))
 
     def _ask(self, within_ms: float) -> None:
+        """Ask one random robot that sent its Hello and was not asked to move recently, if there is one."""
         now = self._now()
         candidates = [
             connection

@@ -112,6 +112,11 @@ class RobotRates:
         return len(known.violations)
 
     def _add(self, robot: RobotId, now: float) -> _Robot:
+        """Return the state of a new robot, with a full bucket.
+
+        If too many robots are in memory, forget first those without ban and violation whose bucket is full,
+        then the oldest ones.
+        """
         if len(self._robots) >= self._max_names:
             remembered = {
                 name: state

@@ -142,6 +142,7 @@ class TokenWatch:
         )
 
     def _revoke(self, connection: RobotConnection, claims: Claims, problem: str) -> None:
+        """Close *connection* because its token is no longer valid for *problem*; log and record this."""
         if not connection.is_closing:
             self._context.log.info("revoked", robot=connection.robot, reason=problem)
             self._recorder.record_cut_off(claims, problem)
@@ -152,6 +153,7 @@ class TokenWatch:
             connection.close(CLOSE_TOKEN_OVER, "token-over")
 
     def _report(self, event: str, connection: RobotConnection) -> None:
+        """Send ``arrived``, ``stays`` or ``left`` to the supervisor, for a connection with a token."""
         claims = connection.claims
         if claims is not None and (event == "left" or connection in self.connections):
             self._send_event(event=event, robot=claims.robot, number=connection.number)

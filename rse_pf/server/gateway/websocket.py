@@ -227,6 +227,7 @@ class RobotSockets:
         pending.close()
 
     def _forget(self, pending: PendingSocket) -> None:
+        """Remove the timer and the reader of a socket that waits for the rest of its request."""
         if pending.timeout is not None:
             pending.timeout.cancel()
             pending.timeout = None
@@ -234,8 +235,7 @@ class RobotSockets:
             self._pending.leave(pending)
 
     def _on_readable(self, pending: PendingSocket) -> None:
-        # Reading is a deferred step, because a thousand sockets may be readable in one round of the event
-        # loop.
+        # The next read is a deferred step, because a thousand sockets may be readable in the same round.
         self._context.loop.remove_reader(pending.accepted.fileno())
         self._steps.add(self._read_on, pending)
 
@@ -295,6 +295,7 @@ class RobotSockets:
             self._refuse(pending, verdict, source, token)
 
     def _refuse(self, pending: PendingSocket, verdict: Rejected, source: str, token: str) -> None:
+        """Count and log the rejection *verdict*, send its HTTP answer and close the socket."""
         self._context.metrics.handshakes[verdict.result] += 1
         if verdict.result != HEALTH:
             about = {"source": source, **claimed_by(token, self._handshake.keys)}
@@ -306,8 +307,7 @@ class RobotSockets:
         listener = Listener(self._dispatcher, verdict, pending.number)
         accepted = pending.accepted
         try:
-            # By default the kernel buffers megabytes, so that this process would notice a slow robot too
-            # late.
+            # By default the kernel buffers megabytes, and this process would notice a slow robot too late.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
             protocol = RobotProtocol(
                 listener, verdict.subprotocol, upgrade, rest,
@@ -402,6 +402,10 @@ class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
         return self._buffer
 
     def buffer_updated(self, n: int) -> None:
+        """Pass the *n* new bytes, up to the end of a CLOSE frame, to picows.
+
+        After `_MAX_READ_BYTES` of one message, let the poller read other sockets first.
+        """
         if self.transport is not None and self.transport.is_close_frame_sent:
             return
         read_bytes = self._read_bytes + n if n == len(self._buffer) else 0
@@ -462,6 +466,10 @@ class Listener(picows.WSListener):  # type: ignore[misc]
             self._connection = None
 
     def pause_writing(self) -> None:
+        """Read nothing more, and disconnect the robot if it does not read its answers in time.
+
+        The transport calls this when its write buffer is full, and `resume_writing` when it is not any more.
+        """
         if self._cut is None:
             self._cut = self._loop.call_later(
                 self._dispatcher.context.settings.serving.slow_reader_timeout_s, self._cut_off
@@ -527,5 +535,6 @@ class Listener(picows.WSListener):  # type: ignore[misc]
             self._linger = self._loop.call_later(_LINGER_S, self._transport.disconnect, False)
 
     def _cut_off(self) -> None:
+        """Disconnect a robot that has not read its answers within ``serving.slow_reader_timeout_s``."""
         self._dispatcher.context.metrics.closed["slow-reader"] += 1
         self._transport.disconnect(False)

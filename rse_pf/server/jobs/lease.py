@@ -225,12 +225,14 @@ class JobLease:
                 return
 
     def _write(self, record: JobRecord) -> bool:
+        """Write *record* and return True; return False, and know the stored record, if it has changed."""
         is_written = self._lease.write(record)
         if not is_written:
             self._watch(self.record)
         return is_written
 
     def _watch(self, record: JobRecord | None) -> JobRecord | None:
+        """Note whether the job of *record* runs, and return *record*."""
         if record is not None and record.state == "running":
             self.is_watched = True
         return record

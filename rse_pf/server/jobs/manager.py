@@ -310,7 +310,7 @@ class JobManager(CommandQueue):
 
     def _too_many_error(self) -> Busy:
         return Busy(
-            f"this server has {self._max_jobs} jobs that run or wait, and takes no more",
+            f"this worker of the server has {self._max_jobs} jobs that run or wait, and accepts no more",
             hint="send the command again after retry_after_ms",
             retry_after_ms=_BUSY_RETRY_MS,
         )

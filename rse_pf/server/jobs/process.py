@@ -142,6 +142,7 @@ class _Reporter:
 def _work(
     request: JobRequest, settings: PlatformSettings, services: str, report: Callable[[float, str], None]
 ) -> list[Any]:
+    """Call the service for the job, and return its encoded answer: ``done`` or ``failed``."""
     out_of_memory = False
 
     def on_defect(_: Command, error: Exception) -> None:
@@ -208,6 +209,7 @@ def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettin
 
 
 def _encode_answer(answer: Result | Failure) -> list[Any]:
+    """Return the message about *answer* to the worker; a reply that cannot be encoded is a failure."""
     if isinstance(answer, Failure):
         return ["failed", answer.code, answer.message, answer.hint]
     try:

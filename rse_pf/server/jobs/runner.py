@@ -158,6 +158,7 @@ def run_job(
 def _follow_or_run(
     request: JobRequest, context: JobContext, signals: JobSignals, report: Report, lease: JobLease
 ) -> JobOutcome:
+    """Repeat the steps of this module until the job has an outcome, and return it."""
     serving = context.settings.serving
     while True:
         if signals.giving_up:
@@ -177,7 +178,7 @@ def _follow_or_run(
         if verdict == "failed" and record is not None:
             return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
         if verdict == "poison":
-            reason = f"{MAX_TRIES} workers ended, or did not reach the store, while they ran this job"
+            reason = f"{MAX_TRIES} workers exited, or did not reach the store, while they ran this job"
             name = record_name(request.robot, request.key)
             hint = f"send less at once; the operator can allow it again by deleting the object {name}"
             return JobOutcome(error=Poison(reason, hint=hint))
@@ -293,6 +294,7 @@ class _JobRun:
 
     @property
     def _is_cancelled(self) -> bool:
+        """Whether the robot cancelled the job here, or by another worker that wrote this to the record."""
         record = self._lease.record
         return self._signals.cancelled or (record is not None and self._lease.is_ours and record.cancel)
 
@@ -347,12 +349,14 @@ class _JobRun:
         return JobOutcome(object=digest, reply=reply, compute_ms=compute_ms)
 
     def _store_failure(self, error: RsePfError) -> JobOutcome:
+        """Write *error* to the record as the outcome of the job, and return it."""
         self._end_lease(
             JobRecord(state="failed", owner="", code=error.code, message=error.message, hint=error.hint)
         )
         return JobOutcome(error=error)
 
     def _end_lease(self, record: JobRecord) -> None:
+        """Write *record*, the outcome, in place of the lease; repeat this after failures of the store."""
         retry_store(lambda: self._lease.end(record))
 
 

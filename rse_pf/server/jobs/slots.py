@@ -66,6 +66,7 @@ class JobSlots:
             fcntl.lockf(self._file, fcntl.LOCK_UN, 1, self._taken.pop())
 
     def _take(self, robot: RobotId, ticket: object) -> bool:
+        """Acquire a free slot if *ticket* is next in the queue of this worker; return whether it was."""
         with self._lock:
             if self._queue.peek() is not ticket or not self._take_any():
                 return False
@@ -74,6 +75,7 @@ class JobSlots:
             return True
 
     def _take_any(self) -> bool:
+        """Lock the first free slot, and return True; return False if all slots are taken."""
         for slot in range(self._count):
             if slot not in self._taken:
                 try:

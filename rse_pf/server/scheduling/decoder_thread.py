@@ -88,6 +88,7 @@ class DecoderThread:
             self._changed.notify()
 
     def _work(self) -> None:
+        """Decode the messages that wait, in the decoder thread, until `close`."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._is_closed)

@@ -46,6 +46,7 @@ class DeferredWork:
             self._loop.call_soon(self._run)
 
     def _run(self) -> None:
+        """Run waiting steps until the time of this round is used, and plan the others for the next round."""
         steps, until = self._steps, self._clock() + self._bound_s
         steps_left = len(steps)
         try:

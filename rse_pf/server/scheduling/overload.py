@@ -33,15 +33,14 @@ __all__ = ["MAX_EARLY_COMMANDS", "PAUSE_S", "OverloadControl", "WaitPerPosition"
 
 # Share of the time from arrival to deadline: a command with a shorter expected wait is always accepted.
 MIN_WAIT_SHARE = 0.2
-# Share of the time from arrival to deadline: a command with a longer expected wait is always refused, because
-# computation and network need the rest.
+# Share of the time from arrival to deadline: a command with a longer expected wait is refused, because
+# computation and network need the rest.  Commands of a tenant with fewer than average are still accepted.
 MAX_WAIT_SHARE = 0.5
 # Share of the time from arrival to deadline: a queued command that has waited for longer is refused, because
 # its answer would come too late.
 MAX_QUEUED_SHARE = 0.75
-# Seconds that computation and network need at most.  A wait up to this time before the deadline is allowed
-# even if it exceeds `MAX_WAIT_SHARE` (with more than 3 s to the deadline) or `MAX_QUEUED_SHARE` (more than 6
-# s).
+# Seconds that computation and network need at most.  A wait until this time before the deadline is allowed,
+# even if it is longer than `MAX_WAIT_SHARE` or `MAX_QUEUED_SHARE` of the time from arrival to deadline.
 RESERVE_S = 1.5
 PAUSE_S = 1.0  # mean pause of a refused robot in seconds: five frames of a camera at 5 Hz
 MAX_EARLY_COMMANDS = 8  # commands that a robot may send in one pause: so many may be in flight when it begins
@@ -93,10 +92,12 @@ class OverloadControl:
         self._advance()
 
     def _is_below_average(self, tenant: str) -> bool:
+        """Return whether *tenant*, this command included, has fewer accepted commands than the average."""
         own = self._accepted.get(tenant, 0)
         return (own + 1) * len(self._accepted) < self._accepted_of_all
 
     def _advance(self) -> None:
+        """Go to the next number of the additive recurrence."""
         self._spread = (self._spread + GOLDEN_RATIO) % 1.0
 
 

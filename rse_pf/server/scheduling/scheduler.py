@@ -176,6 +176,7 @@ class Scheduler:
         return self._overload.pause_s(robot.tenant, expected_wait_s, allowed_s)
 
     def _note_compute(self, spent_s: float) -> None:
+        """Update the share of short commands by one that took *spent_s* seconds."""
         self._short_share += SHORT_SHARE_SMOOTHING * ((spent_s <= SHORT_COMPUTE_S) - self._short_share)
 
 
@@ -188,18 +189,20 @@ def expired_error(queued: QueuedCommand, now: float) -> Expired:
     """Return the error of *queued*, whose deadline passed before its computation began, at *now* (s)."""
     waited_ms = (now - queued.received_s) * 1e3
     return Expired(
-        f"its deadline passed after {waited_ms:.0f} ms in the queue",
+        f"the deadline passed after {waited_ms:.0f} ms in the queue",
         hint="set a longer deadline, or send fewer commands",
     )
 
 
 def _refuse_late(queued: QueuedCommand, now: float) -> RefusedCommand:
+    """Return the refusal of a command that waited until after its deadline, or for too long."""
     if queued.deadline_s <= now:
         return RefusedCommand(queued, expired_error(queued, now), "expired")
     return RefusedCommand(queued, behind_error(PAUSE_S), "behind")
 
 
 def _frame_to_replace(waiting: deque[QueuedCommand], queued: QueuedCommand) -> QueuedCommand | None:
+    """Return the waiting frame of the stream of *queued*, which *queued* replaces; None if there is none."""
     stream = queued.command.stream
     if not _is_replaceable(queued):
         return None
@@ -207,8 +210,9 @@ def _frame_to_replace(waiting: deque[QueuedCommand], queued: QueuedCommand) -> Q
 
 
 def _is_replaceable(queued: QueuedCommand) -> bool:
+    """Return whether a command is a frame, which newer frames of its stream replace."""
     return bool(queued.command.stream) and not queued.command.keep
 
 
 def _stale(queued: QueuedCommand) -> RefusedCommand:
-    return RefusedCommand(queued, Stale("a newer frame of the stream took its place"), "stale")
+    return RefusedCommand(queued, Stale("a newer frame of the stream replaced this frame"), "stale")

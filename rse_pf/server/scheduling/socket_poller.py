@@ -81,6 +81,7 @@ class SocketPoller:
         self._after_callback.append(read_on)
 
     def _read(self) -> None:
+        """Call the callbacks of readable sockets for at most `_MAX_READ_S`; leave the others unread."""
         callbacks, after_callback, clock = self._callbacks, self._after_callback, self._clock
         until_s = clock() + _MAX_READ_S
         while True:

@@ -113,6 +113,7 @@ class RobotAcceptor:
                 self._ready.popleft()[0].close()
 
     def _accept_some(self) -> None:
+        """Accept at most `_ACCEPTS_AT_ONCE` sockets, then pause."""
         for _ in range(_ACCEPTS_AT_ONCE):
             if len(self._ready) >= _MAX_READY:
                 break

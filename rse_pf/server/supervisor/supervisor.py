@@ -184,6 +184,8 @@ class _Processes:
 
 
 class _Supervisor:
+    """The state of a server: starting, ready, draining or leaving, and its processes and control port."""
+
     def __init__(
         self,
         settings: PlatformSettings,
@@ -229,6 +231,7 @@ class _Supervisor:
         )  # fmt: skip
 
     async def run(self) -> int:
+        """Start the server, serve until a drain, a signal or a lost worker, and return the exit code."""
         loop = asyncio.get_running_loop()
         self._over: asyncio.Future[int] = loop.create_future()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -250,6 +253,7 @@ class _Supervisor:
             self._records.note("server.over", exit_code=code)
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Connect to the workers and accept robots; finish with 1 if a worker is not ready in time."""
         readiness = [
             loop.create_task(worker.connect(on_lost=self._on_lost, on_message=self._on_message))
             for worker in self._workers
@@ -270,13 +274,14 @@ class _Supervisor:
         self._acceptor.open()
         self._state = "ready"
         if self._announce is not None:
-            replace_json(self._announce, self._identity())
+            replace_json(self._announce, self._announcement())
         if self._trust is not None:
             self._keep(poll_trust(self._trust, self._workers, self._log))
-        self._log.info("server-ready", **self._identity(), settings=self._digest)
+        self._log.info("server-ready", **self._announcement(), settings=self._digest)
         self._records.note("server.ready", settings=self._digest)
 
-    def _identity(self) -> dict[str, Any]:
+    def _announcement(self) -> dict[str, Any]:
+        """Return the name, process ids and ports of the server, as `serve` announces them."""
         return {
             "server": self._server_id,
             "pid": os.getpid(),
@@ -311,13 +316,13 @@ class _Supervisor:
         if replacement is not None:
             self._keep(self._connect_replacement(replacement))
             if self._announce is not None:
-                replace_json(self._announce, self._identity())
+                replace_json(self._announce, self._announcement())
         elif self._state != "leaving":
             self._log.error("worker-lost", pid=worker.pid, exit_code=worker.exit_code())
             self._finish(_EXIT_LOST)
 
     async def _connect_replacement(self, worker: WorkerProcess) -> None:
-        """Wait until *worker*, which replaces a crashed one, is ready; send it the order of a drain, if any."""
+        """Wait until *worker*, which replaces a crashed one, is ready; repeat the order of a drain to it."""
         await worker.connect(on_lost=self._on_lost, on_message=self._on_message)
         if self._state == "draining":
             worker.order(DrainOrder(MOVE_WITHIN_MS))
@@ -363,9 +368,9 @@ class _Supervisor:
         self._acceptor.close()
         for worker in self._workers:
             worker.order(LeaveOrder(held_s))
-        gone = asyncio.gather(*(worker.gone.wait() for worker in self._workers))
+        all_exited = asyncio.gather(*(worker.exited.wait() for worker in self._workers))
         with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(gone, held_s + _LEAVE_S)
+            await asyncio.wait_for(all_exited, held_s + _LEAVE_S)
         self._finish(_EXIT_OK)
 
     def _finish(self, code: int) -> None:
@@ -375,6 +380,7 @@ class _Supervisor:
             self._over.set_result(code)
 
     def _keep(self, work: Any) -> None:
+        """Run the coroutine *work* as a task, and hold a reference to the task until it is done."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -452,7 +458,7 @@ class _Supervisor:
             results[result] = results.get(result, 0) + n
         return json_reply(
             {
-                **self._identity(),
+                **self._announcement(),
                 "version": installed_version(),
                 "state": self._state,
                 "uptime_s": round(time.monotonic() - self._began, 3),
@@ -522,7 +528,9 @@ class _Supervisor:
     async def _post_services(self, ask: ControlRequest) -> ControlReply:
         """Order the workers to load the services folder again; later /status shows what every worker runs."""
         if not (ask.is_local and self._settings.services.follow):
-            return refused_reply(403, "forbidden", "only here, and with --follow-services")
+            return refused_reply(
+                403, "forbidden", "reload services from the server's own machine, and with --follow-services"
+            )
         for worker in self._workers:
             worker.order(ReloadServicesOrder())
         self._records.note("server.services")
@@ -555,7 +563,7 @@ class _Supervisor:
                 400, "bad-request", f"robots is 0 to {_MAX_MOVES}, spread_s 0 to {_MAX_SPREAD_S:g} seconds"
             )
         if self._state != "ready":
-            return refused_reply(409, "draining", "all its robots move already")
+            return refused_reply(409, "draining", "this server drains: all its robots are asked to move")
         left_s = self._moving_until - time.monotonic()
         if left_s > 0:
             return json_reply({"robots": 0, "spread_s": round(left_s, 3), "under_way": True}, status=202)

@@ -182,6 +182,8 @@ def _plan_of(plan: WorkerPlan, order: BeginOrder) -> WorkerPlan:
 
 
 class _Worker:
+    """Builds the parts of a worker from its plan, obeys orders, and receives sockets."""
+
     def __init__(
         self,
         plan: WorkerPlan,
@@ -286,6 +288,7 @@ class _Worker:
     def _run_services(
         self, plan: WorkerPlan, services: Sequence[InstalledService], answers: Answers
     ) -> ReloadingSandboxes:
+        """Return the queue of installed services, with a sandbox manager that is started."""
         settings = plan.settings
         chosen = settings.services
 
@@ -345,6 +348,7 @@ class _Worker:
         self._sandboxes.replace(services + (packaged_services() if chosen.published else []))
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
+        """Return the queue of long services, whose commands run as jobs."""
         settings = plan.settings
         store = open_data_store(settings)
         context = JobContext(
@@ -384,6 +388,7 @@ class _Worker:
         os._exit(0)  # without waiting for the remaining sockets and threads
 
     def _obey(self, order: WorkerOrder) -> None:
+        """Carry out one order of the supervisor; a `LeaveOrder` is left to `run`."""
         match order:
             case ReportOrder():
                 self._send(event="report", report=self._report())
@@ -428,6 +433,7 @@ class _Worker:
         self._send(event="rows", number=number, count=count, rows=rows)
 
     async def _report_when_empty(self) -> None:
+        """Report to the supervisor when no robot is connected any more."""
         while self._dispatcher.connections:
             await asyncio.sleep(_POLL_S)
         self._send(event="empty")
@@ -464,6 +470,7 @@ class _Worker:
         return not self._sockets.is_behind
 
     def _count_end(self) -> None:
+        """Count a closed socket, and report it to the supervisor within `_GATHER_S`."""
         self._ended += 1
         if not self._flushing:
             self._flushing = True
@@ -496,6 +503,8 @@ class _Worker:
 
 
 def _live_maps(context: WorkerContext, answers: Answers, store: ObjectStore) -> LiveMapRouter:
+    """Return the queue of live maps, which also handles subscriptions to them."""
+
     def make_client(on_update: Callable[[str, str, dict[str, Any]], None]) -> LiveMapClient:
         return LiveMapClient(
             store=store, settings=context.settings, server_id=context.server_id, log=context.log,

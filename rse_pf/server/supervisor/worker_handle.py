@@ -98,7 +98,7 @@ class WorkerProcess:
         is_ready: Whether the worker accepts sockets.
         report: The last report of its metrics; None before the first.
         empty: Set when a draining worker has no robot any more, or the worker has exited.
-        gone: Set when the worker has exited.
+        exited: Set when the worker has exited.
     """
 
     def __init__(self, plan: WorkerPlan) -> None:
@@ -111,7 +111,7 @@ class WorkerProcess:
         self.crash = plan.crash
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
-        self.gone = asyncio.Event()
+        self.exited = asyncio.Event()
         self._exit_code: int | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
@@ -246,11 +246,12 @@ class WorkerProcess:
                 self._handle(msgspec.json.decode(line), ready)
         except OSError:
             pass  # a killed worker resets its channel, which is handled as the end of the channel
-        self.gone.set()
+        self.exited.set()
         self.empty.set()
         self._on_lost(self)
 
     def _handle(self, message: dict[str, Any], ready: asyncio.Event) -> None:
+        """Handle one message of the worker; events of robots and notes are passed to ``on_message``."""
         match message["event"]:
             case "ready":
                 ready.set()
