@@ -156,7 +156,7 @@ class RequestHead:
 
 
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
-    """Return a rejection with a JSON body; *headers* are written with ``_`` for ``-``."""
+    """Return a rejection with a JSON body; *headers* are further HTTP headers, with ``_`` for ``-``."""
     body = refusal_body(code, message, hint)
     return _http_answer(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
 
@@ -217,6 +217,7 @@ class HandshakePolicy:
     def __init__(
         self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
     ) -> None:
+        """Prepare the fixed rejections; with *conformance_echo* every handshake is accepted, to echo messages."""
         self._settings = settings
         self.keys = keys
         self._conformance_echo = conformance_echo

@@ -38,7 +38,8 @@ _INLINE_S = 0.001
 # last round ended, at least `_INLINE_S` and at most `_MAX_INLINE_S`.
 _INLINE_SHARE = 0.5
 _MAX_INLINE_S = 0.005  # greatest limit in seconds, so that timers and control messages are not delayed more
-_MIN_INLINE_S = 1e-6  # seconds that count for a command which took 0 s by the clock: a used round is not at 0
+# Seconds that count for a command which took 0 s by the clock: after a command, a round's time is never 0.
+_MIN_INLINE_S = 1e-6
 
 
 class ThreadQueue(CommandQueue):

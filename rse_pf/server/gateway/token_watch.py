@@ -149,6 +149,7 @@ class TokenWatch:
             connection.close(CLOSE_REVOKED, "revoked")
 
     def _end(self, connection: RobotConnection) -> None:
+        """Close *connection*, because its token has expired."""
         if not connection.is_closing:
             connection.close(CLOSE_TOKEN_OVER, "token-over")
 

@@ -50,7 +50,8 @@ _UPGRADE = (
     b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: %b\r\n\r\n"
 )
-"""The request that picows gets instead of the robot's request: picows keeps it in memory until the end."""
+"""The short request, with the robot's key, that picows gets instead of the robot's request: picows keeps its
+request in memory as long as the connection."""
 _SWITCHING = 101  # HTTP status of an accepted upgrade
 _NO_HEADERS: dict[str, str] = {}
 _MAX_READ_BYTES = 16384  # bytes read from one socket before the next one: up to 2,700 of the smallest frames
@@ -165,6 +166,16 @@ class RobotSockets:
         new_name: Callable[[], str],
         recorder: AuditRecorder,
     ) -> None:
+        """Have no socket yet.
+
+        Args:
+            dispatcher: Gets the connections of accepted robots.
+            handshake: Decides about handshakes.
+            max_robots: Connections of this worker above which handshakes are rejected.
+            workers: Number of workers of the server, each of which has its part of the server's limits.
+            new_name: Returns a name for a robot without a token.
+            recorder: Records handshakes for the audit log.
+        """
         self._dispatcher = dispatcher
         self._context = dispatcher.context
         self._handshake = handshake
@@ -235,11 +246,13 @@ class RobotSockets:
             self._pending.leave(pending)
 
     def _on_readable(self, pending: PendingSocket) -> None:
+        """Read a socket whose bytes have come, in a deferred step."""
         # The next read is a deferred step, because a thousand sockets may be readable in the same round.
         self._context.loop.remove_reader(pending.accepted.fileno())
         self._steps.add(self._read_on, pending)
 
     def _read_on(self, pending: PendingSocket) -> None:
+        """Read a socket that waits for the rest of its request; wait again if the rest is not whole."""
         # A socket that was closed while it waited for this step is not read.
         if pending.timeout is not None and not self._read(pending):
             self._context.loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)

@@ -43,7 +43,7 @@ class ReplaceOrder(msgspec.Struct, tag="replace", tag_field="do", frozen=True):
 
 
 class BlocksOrder(msgspec.Struct, tag="blocks", tag_field="do", frozen=True):
-    """Send a list of the services and robots that are refused after crashes; the answer has this *number*."""
+    """Send a list of the services and requests refused after crashes; the answer has this *number*."""
 
     number: int
 
