@@ -217,7 +217,7 @@ class HandshakePolicy:
     def __init__(
         self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
     ) -> None:
-        """Prepare the fixed rejections; with *conformance_echo* every handshake is accepted, to echo messages."""
+        """Prepare the rejections; with *conformance_echo* every handshake is accepted, to echo messages."""
         self._settings = settings
         self.keys = keys
         self._conformance_echo = conformance_echo

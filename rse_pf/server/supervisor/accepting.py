@@ -29,11 +29,13 @@ from rse_pf.server.gateway.rate_limits import HANDSHAKE_BURST
 __all__ = ["RobotAcceptor"]
 
 _ACCEPTS_AT_ONCE = 128  # sockets accepted before a pause, so that the event loop does its other work
-_ACCEPT_PAUSE_S = 0.005  # seconds of the pause after them: at most 25,600 sockets a second are accepted
+_ACCEPT_PAUSE_S = 0.005  # seconds of the pause after 128 sockets: at most 25,600 a second are accepted
 _MIN_PAUSE_S = 0.01  # shortest wait for a token in seconds, so that several sockets are passed on after it
 _REFUSED_PAUSE_S = 0.1  # seconds from an error of accept, such as no free descriptor, to the next try
 _MAX_READY = 1024  # sockets that wait for a token; while there are so many, no further sockets are accepted
-_LISTEN_BACKLOG = 4096  # connections that the kernel queues for accept; it limits this to net.core.somaxconn
+_LISTEN_BACKLOG = (
+    4096  # connections that may wait in the kernel for accept; net.core.somaxconn is a limit, too
+)
 
 _PEEK = socket.MSG_PEEK | socket.MSG_DONTWAIT
 

@@ -39,7 +39,7 @@ _ENTRIES = 128  # entries of the table, for the newest connections; the supervis
 _TABLE = 8 * 2 * _MAX_THREADS  # offset of the table in bytes, behind two words of 8 bytes for each thread
 # Offset of the text of `faulthandler`: the first memory page behind the table.
 _TEXT = mmap.PAGESIZE * -(-(_TABLE + _ENTRY_BYTES * _ENTRIES) // mmap.PAGESIZE)
-_MAX_TEXT_BYTES = 1 << 17  # bytes of that text that are read
+_MAX_TEXT_BYTES = 1 << 17  # bytes of the text of `faulthandler` that the supervisor reads at most
 _THREAD = re.compile(rb"Current thread 0x([0-9a-f]{1,16}) ")
 _FRAME = re.compile(rb'File "([^"\n]{1,500})", line (\d{1,9}) in ([^\n]{1,200})')
 
@@ -126,6 +126,7 @@ class CrashReport:
             self._file = -1
 
     def _robot_of(self, number: int) -> RobotId | None:
+        """Return the robot of the connection *number* from the table; None if its entry was overwritten."""
         at = _TABLE + number % _ENTRIES * _ENTRY_BYTES
         entered, length = _ENTRY.unpack_from(self._memory, at)
         if not number or entered != number:

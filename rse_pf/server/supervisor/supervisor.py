@@ -414,6 +414,7 @@ class _Supervisor:
         return json_reply({"code": "not-found"}, status=405 if known else 404)
 
     async def _healthz(self, ask: ControlRequest) -> ControlReply:
+        """Return name, version, settings digest and uptime; the status is 200 as long as the server runs."""
         return json_reply(
             {
                 "server": self._server_id,
@@ -424,6 +425,10 @@ class _Supervisor:
         )
 
     async def _readyz(self, ask: ControlRequest) -> ControlReply:
+        """Return status 200 if the server accepts robots, and 503 while it starts, drains or leaves.
+
+        With installed services, the page also has what their isolation lacks, and open circuit breakers.
+        """
         readiness: dict[str, Any] = {"state": self._state}
         if self._settings.services.folder or self._settings.services.published:
             await self._merge_reports()
@@ -436,6 +441,7 @@ class _Supervisor:
         return json_reply(readiness, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
 
     async def _metrics(self, ask: ControlRequest) -> ControlReply:
+        """Return the metrics of all workers and of the supervisor in the text format of Prometheus."""
         merged = await self._merge_reports()
         merged["gauges"].update(
             {
@@ -451,6 +457,7 @@ class _Supervisor:
         return ControlReply(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _status(self, ask: ControlRequest) -> ControlReply:
+        """Return the state, load, results, CPU seconds and memory of the server as JSON, for operators."""
         merged = await self._merge_reports()
         gauges = merged["gauges"]
         results: dict[str, int] = {}
@@ -485,6 +492,7 @@ class _Supervisor:
         )
 
     async def _blocks(self, ask: ControlRequest) -> ControlReply:
+        """Return rows for at most `_MAX_BLOCKS` refusals after crashes; ``count`` is the number of all."""
         return json_reply(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
 
     async def _robots(self, ask: ControlRequest) -> ControlReply:
@@ -537,6 +545,7 @@ class _Supervisor:
         return json_reply({"workers": len(self._workers)}, status=202)
 
     async def _post_drain(self, ask: ControlRequest) -> ControlReply:
+        """Begin to drain the server; ``wait`` in the query replaces ``serving.drain_wait_s``."""
         if not ask.is_local:
             return refused_reply(403, "forbidden", "drain from the server's own machine")
         try:
@@ -571,9 +580,10 @@ class _Supervisor:
         return json_reply({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
 
     def _migrate(self, robots: int, spread_s: float) -> tuple[int, float]:
-        """Order the workers to ask as many as *robots* to move to another server, within *spread_s* or more.
+        """Order the workers to ask at most *robots* robots to move to another server.
 
-        Return how many robots are asked, and the seconds until the last of them is asked.
+        The requests are spread over *spread_s* seconds, or longer if they were more than `MOVES_PER_S`.
+        Return how many robots are asked, and the seconds until the last one of them is asked.
         """
         delays = plan(
             [worker.load for worker in self._workers], robots, spread_s=spread_s,

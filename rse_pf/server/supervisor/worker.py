@@ -485,7 +485,7 @@ class _Worker:
             self._flushing = True
             self._loop.call_later(_POLL_S, self._flush_ends)
         except OSError:
-            self._ended = 0  # the supervisor has exited; the control channel ends this process
+            self._ended = 0  # the supervisor has exited, so that this process exits, too
 
     def _new_name(self) -> str:
         """Return a name for a robot without a token, unique among the workers of the server."""
