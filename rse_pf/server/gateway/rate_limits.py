@@ -38,7 +38,8 @@ __all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RATE_BAN_S", "RobotRates", "SourceRate
 CUT_OFF = math.inf
 """Result of `RobotRates.retry_after_ms` for a robot that ignores refusals: close its connection."""
 
-RATE_BAN_S = 5.0  # seconds for which a robot that was disconnected for its rate cannot connect again
+# Seconds for which a robot cannot connect after it was disconnected for its rate or undecodable messages.
+RATE_BAN_S = 5.0
 HANDSHAKE_BURST = 1000.0  # sockets, or handshakes of one address, accepted at once: a fleet that reconnects
 _MAX_NAMES = 20000  # robots, or addresses, in memory at most; those with full buckets are forgotten first
 _MIN_RETRY_MS = 1.0  # shortest pause of a refused robot in milliseconds: 0 would mean that it was accepted

@@ -37,8 +37,8 @@ MAX_TRIES = 3  # a job is not run again after so many workers failed while they 
 
 State = Literal["running", "given-up", "done", "failed", "swept"]
 Verdict = Literal["take", "follow", "done", "failed", "poison"]
-"""What a worker does about a job: run it, wait for the worker that runs it, return its stored result, return
-its stored error, or refuse it for good after `MAX_TRIES`."""
+"""What a worker does about a job: ``take`` runs it, ``follow`` waits for the worker that runs it, ``done``
+and ``failed`` return the stored result or error, ``poison`` refuses it after `MAX_TRIES` failed workers."""
 
 
 class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -49,7 +49,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             record is deleted.
         owner: Name of the worker that holds the lease; "" if none does.
         beat: Number of renewals of the lease.
-        tries: Number of runs, this one included, after workers failed.
+        tries: 1, plus the number of workers that failed one after the other while they ran the job.
         share: Progress of the job, 0..1; ``what`` describes it.
         cancel: Whether a follower asks the holder of the lease to cancel the job.
         reply: sha256 of the reply, which is an object of the robot; ``reply_bytes`` is its length.

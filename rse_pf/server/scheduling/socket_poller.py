@@ -75,8 +75,8 @@ class SocketPoller:
     def read_after_others(self, read_on: Callable[[], None]) -> None:
         """Call *read_on* when the callback of the present socket has returned.
 
-        A transport that paused reading before continues then, and its socket is polled again after the other
-        readable sockets.
+        A transport that has paused reading gives the function that resumes it, so that its socket is read
+        again only after the other readable sockets.
         """
         self._after_callback.append(read_on)
 

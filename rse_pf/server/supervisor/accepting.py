@@ -33,9 +33,7 @@ _ACCEPT_PAUSE_S = 0.005  # seconds of the pause after 128 sockets: at most 25,60
 _MIN_PAUSE_S = 0.01  # shortest wait for a token in seconds, so that several sockets are passed on after it
 _REFUSED_PAUSE_S = 0.1  # seconds from an error of accept, such as no free descriptor, to the next try
 _MAX_READY = 1024  # sockets that wait for a token; while there are so many, no further sockets are accepted
-_LISTEN_BACKLOG = (
-    4096  # connections that may wait in the kernel for accept; net.core.somaxconn is a limit, too
-)
+_LISTEN_BACKLOG = 4096  # connections that may wait for accept in the kernel, if net.core.somaxconn allows it
 
 _PEEK = socket.MSG_PEEK | socket.MSG_DONTWAIT
 
