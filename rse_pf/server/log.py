@@ -91,6 +91,7 @@ class JsonLog:
         self._writer.join(timeout_s)
 
     def _line(self, level: str, event: str, fields: dict[str, Any]) -> None:
+        """Queue the line of an event, with long strings cut; drop it if the queue is full."""
         if _LEVELS[level] < self._lowest:
             return
         if isinstance(fields.get("robot"), RobotId):

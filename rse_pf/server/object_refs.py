@@ -42,9 +42,9 @@ def takes_objects(request_type: type[Any]) -> bool:
 
 
 def named_in(request_type: type[Any], payload: Any) -> list[str]:
-    """Return the digest of each reference in *payload*, in order; a digest may occur several times.
+    """Return the digest of each reference ``{"object": DIGEST}`` in *payload*, in order, with repetitions.
 
-    Only dicts in the places where *request_type* declares ``bytes`` are references.
+    Only such dicts in places where *request_type* declares ``bytes`` are references.
 
     Raises:
         BadRequest: A reference is not a dict of one key with a sha256 in hexadecimal digits.
@@ -58,9 +58,9 @@ def resolve(
     robot: RobotId,
     store: ObjectStore,
 ) -> Any:
-    """Return *payload* with each reference replaced by the bytes of the robot's object; blocks on the store.
+    """Return *payload* with each reference ``{"object": DIGEST}`` replaced by the bytes of the stored object.
 
-    A payload without references is returned unchanged, without a request to the store.
+    This blocks on the store; a payload without references is returned unchanged, without a request to it.
 
     Args:
         request_type: The request type of the service, a msgspec Struct.
@@ -104,7 +104,7 @@ class ObjectRefs:
     """The quotas of tenants, and of robots without a quota of their own."""
 
     def has_references(self, command: Command, service: Service) -> bool:
-        """Return whether the payload of *command* has a reference; always False without a store.
+        """Return whether the payload of *command* refers to a stored object; always False without a store.
 
         For a service whose request type has no ``bytes`` the payload is not searched.
         """
@@ -112,7 +112,7 @@ class ObjectRefs:
         return shape is not None and any(True for _ in _references(shape, command.payload))
 
     def resolve_references(self, command: Command, registry: Registry, robot: RobotId) -> Command:
-        """Return *command* with each reference in its payload replaced by bytes; blocks on the store.
+        """Return *command* with stored objects in place of references to them; blocks on the store.
 
         Without a store, or without a reference, *command* itself is returned.
 
@@ -190,6 +190,7 @@ class _Fields:
 
 
 def _shape(request_type: Any) -> Any:
+    """Return the shape of *request_type*, None if it contains no ``bytes``; computed once for each type."""
     return _cached_shape(request_type)
 
 
@@ -258,6 +259,7 @@ def _replace(shape: Any, value: Any, read: Callable[[Any], Any]) -> Any:
 
 
 def _digest(value: dict[str, Any]) -> str:
+    """Return the digest in the reference *value*; raises BadRequest."""
     digest = value[_KEY]
     if len(value) != 1 or not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         raise BadRequest(
