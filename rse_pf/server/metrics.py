@@ -32,7 +32,7 @@ BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0
 
 GAUGE_HELP = {
     "robots": "robots that are connected to the server now, without synthetic ones such as the canary",
-    "queue": "commands that wait for a solver thread",
+    "queue": "commands to stateless services that wait to be computed",
     "queue_oldest_s": "age of the command that has waited longest, in seconds",
     "queue_ms": "longest wait of a command in the last second or two, in milliseconds",
     "in_flight": "commands that a solver thread computes now",

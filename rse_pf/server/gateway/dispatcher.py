@@ -371,7 +371,7 @@ class Dispatcher:
             connection.refuse_updates(identity, error)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the counters, gauges and sections of this worker's report; reset the event loop's lag to 0."""
+        """Return counters, gauges and sections of this worker's report; set the event loop's lag to 0."""
         reports = [queue.report() for queue in self._queues]
         metrics = self.context.metrics
         gauges = {
