@@ -1,4 +1,5 @@
-"""Experiments: the demo, the load generator, and the experiments of the paper's Section 6.
+"""Experiments: the demo, the load generator, and the experiments of the RSE-PF paper's Section 6.
 
-They may use every package but `stacks`; what robots or servers need at run time belongs elsewhere.
+The modules of this package may import every package but `stacks`.  Code that robots or servers need at run
+time does not belong here.
 """

@@ -1,7 +1,8 @@
-"""Child processes that run robots, and the messages that all of them exchange with their parent.
+"""Child processes that run robots, and the messages between such a process and its parent.
 
-Demo and load generator start a process per robot or group of robots; every process needs tokens, which only
-the parent can issue, and reports when it is ready or has failed.
+The demo starts one process per robot, the load generator one per group of robots.  A child requests the
+tokens of its robots from the parent, which alone has the signing key, and reports when it is ready or has
+failed.
 """
 
 from __future__ import annotations
@@ -30,20 +31,20 @@ __all__ = [
 
 T = TypeVar("T")
 
+# `ParentPipe.token` returns the same token for this long, in seconds; by default a token is valid for 900 s.
 _TOKEN_AGE_S = 60.0
-"""Uploads use a token for this long; its ttl is ten times longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class TokenRequest:
-    """From the child: a robot connects and needs a token."""
+    """Message of a child to its parent: the robot named ``robot`` is about to connect and needs a token."""
 
     robot: str
 
 
 @dataclass(frozen=True, slots=True)
 class IssuedToken:
-    """From the parent: the answer to a `TokenRequest`."""
+    """Answer of the parent to a `TokenRequest`: the signed token of the robot named ``robot``."""
 
     robot: str
     token: str
@@ -51,29 +52,33 @@ class IssuedToken:
 
 @dataclass(frozen=True, slots=True)
 class ChildReady:
-    """From the child: it can start; ``frames`` is how many it will send, 0 if that is open."""
+    """Message of a child to its parent: its robots are ready to start.
+
+    ``frames`` is the number of frames that the child will send; 0 means that the number is not known.
+    """
 
     frames: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class ChildFailed:
-    """From the child: it has ended with an error, which ``report`` describes in two lines."""
+    """Last message of a child that exits with an error: ``report`` is the error's message and its hint."""
 
     report: str
 
     def error(self, name: str) -> CommandFailed:
-        """Return the error for the parent to raise."""
+        """Return the error that the parent raises for the child process *name*, with the child's hint."""
         problem, _, hint = self.report.partition("\n  hint: ")
         return CommandFailed(f"{name}: {problem}", hint=hint)
 
 
 class ParentPipe:
-    """The pipe of a robot to its parent: any thread sends, and a thread that `listen` starts receives.
+    """The pipe between a robot's process and its parent.
 
-    Tokens are requested by the connection on the event loop and by uploads on threads of their own; all
-    tokens of a robot are equal, so any of them answers any request.  When the parent has ended, every wait
-    ends.
+    Every thread may send; one thread, which `listen` starts, receives.  The robot's connection requests
+    tokens on the event loop, and uploads request them on threads of their own; a received token may be handed
+    to any of the waiting threads, since all tokens of a robot allow the same.  When the parent closes the
+    pipe or exits, every call that waits raises Disconnected.
     """
 
     def __init__(self, pipe: Connection, robot: str, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -87,25 +92,40 @@ class ParentPipe:
         self._held: tuple[str, float] | None = None
 
     def listen(self) -> None:
-        """Start to receive; the thread ends with the process or with the parent."""
+        """Start the daemon thread that receives messages until the parent closes the pipe or exits."""
         threading.Thread(target=self._receive, name="parent", daemon=True).start()
 
     def send(self, message: Any) -> None:
-        """Send *message* to the parent."""
+        """Pickle *message* and write it to the pipe.
+
+        Threads that call this at the same time wait for each other.
+        """
         with self._sending:
             self._pipe.send(message)
 
     def wait_start(self) -> float:
-        """Wait for the start and return its time; raises Disconnected if the parent has ended."""
+        """Wait until the parent sends the start time and return that time (s, `time.monotonic`).
+
+        Raises:
+            Disconnected: The parent has closed the pipe or exited.
+        """
         return _got(self._starts)
 
     def fresh_token(self) -> str:
-        """Ask for a new token and wait for it; raises Disconnected if the parent has ended."""
+        """Request a new token from the parent and wait for it.
+
+        Raises:
+            Disconnected: The parent has closed the pipe or exited.
+        """
         self.send(TokenRequest(self._robot))
         return _got(self._tokens)
 
     def token(self) -> str:
-        """Return a token that is at most a minute old; raises Disconnected if the parent has ended."""
+        """Return a token that was received at most 60 s ago, or request a new one.
+
+        Raises:
+            Disconnected: The parent has closed the pipe or exited.
+        """
         with self._asking:
             if self._held is None or self._clock() - self._held[1] > _TOKEN_AGE_S:
                 self._held = (self.fresh_token(), self._clock())
@@ -127,7 +147,7 @@ class ParentPipe:
 def _got(inbox: queue.SimpleQueue[T | None]) -> T:
     message = inbox.get()
     if message is None:
-        inbox.put(None)  # ends every other wait as well
+        inbox.put(None)  # so that every other thread that waits for this queue raises Disconnected as well
         raise Disconnected("the demo has ended without this robot", hint="read the last lines of its output")
     return message
 
@@ -135,7 +155,10 @@ def _got(inbox: queue.SimpleQueue[T | None]) -> T:
 def start_process(
     target: Callable[[Any, Connection], None], spec: Any, name: str
 ) -> tuple[BaseProcess, Connection]:
-    """Start ``target(spec, pipe)`` in a new process; return the process and the parent's end of the pipe."""
+    """Start ``target(spec, pipe)`` in a new spawned daemon process.
+
+    Return the process and the parent's pipe end.
+    """
     context = multiprocessing.get_context("spawn")
     pipe, child_pipe = context.Pipe()
     process = context.Process(target=target, args=(spec, child_pipe), name=name, daemon=True)
@@ -145,7 +168,10 @@ def start_process(
 
 
 def end_process(process: BaseProcess, pipe: Connection, timeout_s: float) -> None:
-    """Close *pipe*, wait up to *timeout_s* for the end of *process*, then kill it."""
+    """Close *pipe* and wait up to *timeout_s* seconds until *process* exits.
+
+    Kill it if it is still running then.
+    """
     pipe.close()
     process.join(timeout_s)
     if process.is_alive():

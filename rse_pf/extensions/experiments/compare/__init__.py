@@ -1,4 +1,4 @@
 """Compare configurations of the tracker on recordings: ``rse-pf compare``.
 
-What tracks belongs to `client_sdk`; the formulas of the errors belong to
-`rse_pf.extensions.experiments.results`."""
+The tracker is in `client_sdk`, and the computation of errors in `rse_pf.extensions.experiments.results`.
+"""

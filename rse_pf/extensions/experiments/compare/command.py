@@ -27,12 +27,13 @@ from rse_pf.errors import UsageError
 
 __all__ = ["ACTION"]
 
+# Largest ``--runs``: repetitions of each run.
 _MAX_RUNS = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRequest(SensorRequest, AcceptRequest):
-    """Configurations and recordings that are compared."""
+    """Options of ``rse-pf compare``: configurations of the tracker, and the recordings to track with them."""
 
     configs: tuple[str, ...] = option(
         nargs="*",
@@ -67,7 +68,7 @@ class CompareRequest(SensorRequest, AcceptRequest):
 
 
 def compare(request: CompareRequest, settings: PlatformSettings) -> int:
-    """Check the options and run the comparison."""
+    """Check the options and run the comparison; return the exit code."""
     if not 1 <= request.runs <= _MAX_RUNS:
         raise UsageError(f"--runs {request.runs} is not within 1..{_MAX_RUNS}", hint="3 show a spread")
     for rate_hz in request.rate:

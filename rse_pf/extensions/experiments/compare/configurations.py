@@ -1,7 +1,7 @@
-"""The configurations that are compared: built in by name, a file ``NAME.toml`` or ``NAME.py``, or features.
+"""The configurations that ``rse-pf compare`` compares: a built-in name, a file, or a function for features.
 
-A Python file sets options and functions by names of its own module; it runs in this process, as the user who
-named it.  Whatever is wrong with a file is said in one line.
+A file ``NAME.toml`` sets options; a file ``NAME.py`` sets options and functions by module-level names, and is
+run in this process.  Every mistake in a file is reported as a UsageError of one line.
 """
 
 from __future__ import annotations
@@ -34,21 +34,26 @@ BUILT_IN = {
     "features-N": "with N features in each frame, such as features-500",
     "MODULE:FUNCTION": "with features of your own, as for rse-pf demo --features",
 }
-"""Name and one line of help."""
+"""The built-in configurations: name, and one line of help."""
 SLOTS = ("features", "motion", "loops", "optimiser")
-"""Functions that a Python file may set: arguments of `Mapper`."""
+"""Functions that a Python file may set; each is the argument of `Mapper` of the same name."""
+# Options that a file may set.
 _OPTIONS = ("base", "depth", "frontend", "monocular")
 _FEATURES = re.compile(r"features-(\d{1,6})")
-_MIN_FEATURES, _MAX_FEATURES = 50, 20_000
-_MAX_BYTES = 16 << 10  # of TOML: the time for a name grows with the square of its parts
+# Smallest and largest N of ``features-N``.
+_MIN_FEATURES = 50
+_MAX_FEATURES = 20_000
+# Largest TOML file, in bytes: the time to parse a dotted name grows with the square of its parts.
+_MAX_BYTES = 16 << 10
 _Options = TypeVar("_Options", FrontEndOptions, MonocularOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Configuration:
-    """One way to track; ``depth`` None uses it where the recording has some.
+    """A configuration of the tracker.
 
-    ``slots`` are arguments of `Mapper` by name; ``source`` is the file that set them, empty if built in.
+    ``depth`` says whether depth images are used; None uses them if the recording has some.  ``slots`` holds
+    the user's functions by the names of `SLOTS`; ``source`` is the file that set them, empty if built in.
     """
 
     name: str
@@ -60,10 +65,11 @@ class Configuration:
 
 
 def configurations_of(words: Sequence[str]) -> list[Configuration]:
-    """Return the configurations that *words* name, in their order.
+    """Return the configurations that *words* name, in the same order.
 
     Raises:
-        UsageError: A word is neither a name nor a usable file, or two have one name.
+        UsageError: A word is neither a built-in name nor a usable file, or two configurations have the same
+            name.
     """
     found = [_configuration(word) for word in words]
     names = [configuration.name for configuration in found]
@@ -76,7 +82,7 @@ def configurations_of(words: Sequence[str]) -> list[Configuration]:
 
 
 def failure_line(path: str, error: BaseException) -> str:
-    """Return what a user's file raised, with the line of the file where it did."""
+    """Return one line about *error* raised by the user's file *path*: file, line number, type and message."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == path]
     line = error.lineno if isinstance(error, SyntaxError) else (lines[-1] if lines else None)
     said = (error.msg if isinstance(error, SyntaxError) else str(error)).strip().split("\n")[0]
@@ -150,7 +156,11 @@ def _from_values(
 
 
 def _changed(section: str, options: _Options, values: Any) -> _Options:
-    """Return *options* with the values of a table, each of the type that it has there."""
+    """Return *options* with the values of a table; a complete options object in *values* replaces them.
+
+    Raises:
+        UsageError: *values* is no table, an option is unknown, or a value has another type than the default.
+    """
     if isinstance(values, type(options)):
         return values
     if not isinstance(values, Mapping):
@@ -209,7 +219,11 @@ def _read_python(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Callable[.
 
 
 def _module_of(path: Path) -> Any:
-    """Return the module of a user's file, which may import what lies beside it."""
+    """Import the user's file *path* as a module; it may import other files of the same folder.
+
+    Raises:
+        UsageError: The file raised an exception.
+    """
     spec = importlib.util.spec_from_file_location(f"compared_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None

@@ -1,6 +1,6 @@
-"""The ATE that evo computes, where it is installed: by its own command, in a process of its own.
+"""The ATE that the program evo computes, if evo is installed, as a check of our own ATE.
 
-evo is GPL-3 software: it is never imported here, and gets trajectory files only.
+evo is GPL-3 software: it is never imported, but run as the command ``evo_ape`` with trajectory files.
 """
 
 from __future__ import annotations
@@ -19,18 +19,27 @@ __all__ = ["evo_ate_cm", "evo_command"]
 
 _COMMAND = "evo_ape"
 _RMSE = re.compile(r"^\s*rmse\s+([0-9.eE+-]+)\s*$", re.MULTILINE)
+# Time limit of one run of evo, in seconds.
 _WAIT_S = 60.0
+# Largest difference of two time stamps that evo takes for the same, in seconds: we write the same stamps in
+# both files.
 _SAME_S = "0.001"
 
 
 def evo_command() -> str | None:
-    """Return the path of ``evo_ape``, beside this interpreter or on the path; None without evo."""
+    """Return the path of ``evo_ape`` in the folder of this interpreter or on PATH.
+
+    None if evo is not installed.
+    """
     beside = Path(sys.executable).with_name(_COMMAND)
     return str(beside) if beside.is_file() else shutil.which(_COMMAND)
 
 
 def evo_ate_cm(command: str, errors: Accuracy) -> float | None:
-    """Return evo's rmse of the positions that *errors* compares, aligned by evo; None if it gives none."""
+    """Return the ATE (rmse, cm) that evo computes of the trajectories in *errors*, with evo's own alignment.
+
+    None if evo fails, or takes longer than 60 s.
+    """
     with tempfile.TemporaryDirectory() as name:
         truth, estimate = Path(name) / "truth.txt", Path(name) / "estimate.txt"
         write_trajectory(truth, errors.truth)

@@ -1,4 +1,4 @@
-"""The recordings that a comparison reads: all formats of the SDK, and rendered worlds by ``world:SEED``."""
+"""The recordings that a comparison reads: all formats of the SDK, and rendered worlds (``world:SEED``)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,18 @@ from rse_pf.errors import UsageError
 __all__ = ["Drive", "drives_of", "open_recording"]
 
 _WORLD = re.compile(r"world:(\d{1,9})")
+# Frames of a rendered world.
 _WORLD_FRAMES = 80
+# A requested rate of more than this many times that of the recording is reported as too high.
 _ABOVE = 1.05
-"""A rate that is so many times the recording's is above it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """A recording at one rate; ``rate_hz`` is that of its frames, ``notes`` what the user should know."""
+    """A recording thinned to one rate.
+
+    ``rate_hz`` is the rate of its frames, ``notes`` are shown to the user.
+    """
 
     dataset: Dataset
     rate_hz: float
@@ -31,7 +35,7 @@ class Drive:
 
     @property
     def name(self) -> str:
-        """The recording and the rate, for people."""
+        """The name of the recording and the rate, as text for the user."""
         return f"{self.dataset.name} at {self.rate_hz:.3g} Hz"
 
 
@@ -42,12 +46,14 @@ def drives_of(
     camera: CameraChoice | None = None,
     imu: bool | None = None,
 ) -> list[Drive]:
-    """Return each recording at each rate; without rates at its own.
+    """Return each of the recordings *words* at each of *rates_hz*.
 
-    *camera* and *imu* are those of `open_dataset`.
+    Without rates, at the recording's own rate.
+    Rates that give the same frames of a recording give one drive.  *camera* and *imu* are those of
+    `open_dataset`.
 
     Raises:
-        UsageError: A recording cannot be read, or two have one name.
+        UsageError: A recording cannot be read, or two recordings have the same name.
     """
     drives: list[Drive] = []
     names: dict[str, str] = {}
@@ -64,10 +70,10 @@ def drives_of(
 
 
 def open_recording(word: str, *, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
-    """Return the recording that a path or ``world:SEED`` names.
+    """Return the recording that *word* names, a path or ``world:SEED``.
 
     Raises:
-        UsageError: It is none.
+        UsageError: The recording cannot be read or contradicts itself, or the seed is malformed.
     """
     world = _WORLD.fullmatch(word)
     if world is not None:

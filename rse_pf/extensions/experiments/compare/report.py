@@ -1,6 +1,6 @@
 """The report of a comparison: ``compare.json`` and the table in the terminal.
 
-These functions format only; figures come from the runs.
+The functions format figures; the figures of a run are computed in `tracking_run`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _COLUMNS = (
     ("bytes_a_keyframe", "B/keyframe", ".0f"),
     ("keyframes", "keyframes", "d"), ("robot_ms", "robot ms", ".1f"), ("server_ms", "server ms", ".1f"),
 )  # fmt: skip
-"""Figure, its heading, and how it is written."""
+"""The columns of the table in the terminal: name of the figure, heading, and format specification."""
 
 
 def row_of(
@@ -32,7 +32,11 @@ def row_of(
     runs: Sequence[TrackingRun],
     evo_ate_cm: Sequence[float | None],
 ) -> dict[str, Any]:
-    """Return a row of ``compare.json``: every figure with its least and largest value over the runs."""
+    """Return the row of ``compare.json`` for *configuration* on *drive*.
+
+    ``figures`` holds the least and the largest value of each figure over *runs*; *evo_ate_cm* has the ATE of
+    evo for each run, None where there is none.
+    """
     figures: dict[str, Any] = {name: _spread([run.figures[name] for run in runs]) for name in runs[0].figures}
     if any(value is not None for value in evo_ate_cm):
         figures["evo_ate_cm"] = _spread(evo_ate_cm)
@@ -61,7 +65,7 @@ def make_report(
     environment: Mapping[str, Any],
     load_after: Sequence[float],
 ) -> dict[str, Any]:
-    """Return ``compare.json``."""
+    """Return the content of ``compare.json``: rows, parameters of the errors, configurations, environment."""
     return {
         "experiment": "compare",
         "solved_by": solved_by,
@@ -85,7 +89,7 @@ def make_report(
 
 
 def drive_heading(drive: Drive, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the line above the rows of one drive."""
+    """Return the line above the table of a drive: name, sensors, frames, duration, truth and alignment."""
     dataset, stamps_s = drive.dataset, drive.dataset.timestamps_s
     kinds = list(dict.fromkeys(row["alignment"] for row in rows))
     frames = f"{drive.name}, {dataset.sensors}: {len(dataset)} frames, {stamps_s[-1] - stamps_s[0]:.1f} s"
@@ -96,7 +100,10 @@ def drive_heading(drive: Drive, rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the lines of the table of one drive, aligned; a column without any figure is left out."""
+    """Return the lines of the table of one drive, with aligned columns.
+
+    A column without any value is left out.
+    """
     shown = [
         column for column in _COLUMNS
         if any(row["figures"].get(column[0], (None,))[0] is not None for row in rows)
@@ -113,7 +120,7 @@ def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def tolerance_line() -> str:
-    """Return how the errors are measured, in one line."""
+    """Return the line that says how ATE and RPE are computed, for the terminal."""
     return (
         f"ATE of the whole trajectory, RPE over {STEP_S:g} s; truth interpolated between true poses at most "
         f"{MAX_TRUTH_GAP_S:g} s apart, or within {1e3 * SAME_STAMP_S:g} ms; a lost frame lowers posed"
@@ -121,7 +128,7 @@ def tolerance_line() -> str:
 
 
 def runs_line(rows: Sequence[Mapping[str, Any]], *, is_platform: bool) -> str:
-    """Return what is known of the spread of the runs, in one line."""
+    """Return the line that says whether the poses of repeated runs are the same, for the terminal."""
     runs = rows[0]["runs"]
     if runs == 1:
         how = "as the platform's answers arrive" if is_platform else "without a clock or network"

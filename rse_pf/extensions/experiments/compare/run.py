@@ -1,4 +1,4 @@
-"""Compare configurations: track every recording with each of them, and write table, JSON and picture."""
+"""Run a comparison: track every recording with each configuration, and write table, JSON and image."""
 
 from __future__ import annotations
 
@@ -34,13 +34,20 @@ from rse_pf.terminal import show, show_progress
 
 __all__ = ["CompareOptions", "run_compare"]
 
-REPORT, PICTURE, TRAJECTORIES = "compare.json", "compare.png", "trajectories"
+REPORT = "compare.json"
+PICTURE = "compare.png"
+TRAJECTORIES = "trajectories"
+# Characters of names that are replaced by "_" in file names.
 _NOT_PLAIN = re.compile(r"[^\w.-]")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompareOptions:
-    """Options of the command line."""
+    """Options of ``rse-pf compare``.
+
+    ``runs`` is the number of repetitions of each run; ``platform`` solves the poses by a platform that is
+    started on this machine, instead of in this process.
+    """
 
     configurations: Sequence[Configuration]
     drives: Sequence[Drive]
@@ -48,14 +55,17 @@ class CompareOptions:
     out: Path = Path("out-compare")
     platform: bool = False
     accepted: tuple[str, ...] = ()
-    """Names of doubts about the recordings that the user takes for right."""
+    """Names of findings about the recordings that the user accepts.
+
+    So they are not shown (``--accept``).
+    """
 
 
 def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
-    """Run the comparison; return 0.
+    """Run the comparison, write its results to ``options.out``, and print them; return 0.
 
     Raises:
-        CommandFailed: A run gave no pose.
+        CommandFailed: No frame of a run got a pose; the results are written before.
     """
     _make_folder(options.out)
     load_opencv().setNumThreads(1)
@@ -91,7 +101,7 @@ def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
 
 
 def _doubts(options: CompareOptions) -> list[str]:
-    """Return what is unlikely about the recordings, a line for each doubt."""
+    """Return a line for each finding about the recordings that the user has not accepted."""
     datasets = {drive.dataset.name: drive.dataset for drive in options.drives}
     return [
         doubt.line()
@@ -103,7 +113,10 @@ def _doubts(options: CompareOptions) -> list[str]:
 async def _compare(
     options: CompareOptions, settings: PlatformSettings
 ) -> tuple[list[dict[str, Any]], list[Panel]]:
-    """Return all rows, and a panel of the picture for each drive; show each table when it is complete."""
+    """Run all configurations on all drives; print the table of each drive once it is complete.
+
+    Return the rows of the report, and a panel of the image for each drive.
+    """
     evo = evo_command()
     rows: list[dict[str, Any]] = []
     panels: list[Panel] = []
@@ -140,7 +153,10 @@ async def _compare(
 async def _solvers(
     options: CompareOptions, settings: PlatformSettings
 ) -> AsyncIterator[Callable[[], MeteredSolver]]:
-    """Give a function that returns the solver of the next run."""
+    """Yield a function that returns the solver of the next run.
+
+    In this process each run has a solver of its own; with a platform all runs share one.
+    """
     if not options.platform:
         yield lambda: InProcessSolver(settings)
         return
@@ -151,7 +167,7 @@ async def _solvers(
 async def _run(
     options: CompareOptions, configuration: Configuration, drive: Drive, solver: MeteredSolver, number: int
 ) -> TrackingRun:
-    """Track once, and keep the trajectory."""
+    """Track *drive* once with *configuration*, and write the trajectory of run *number* to a file."""
 
     def progress(frames: int) -> None:
         doing = f"{drive.name}: {configuration.name}, run {number}"
@@ -166,7 +182,10 @@ async def _run(
 
 
 def _panel(drive: Drive, rows: Sequence[Mapping[str, Any]], runs: Sequence[TrackingRun]) -> Panel:
-    """Return the panel of a drive; without truth each path begins where its camera does."""
+    """Return the panel of a drive with the path of each configuration.
+
+    Paths are aligned with the true one; without a truth each path is in the frame of its own first camera.
+    """
     paths = []
     for row, run in zip(rows, runs, strict=True):
         ate_cm = row["figures"]["ate_cm"][0]

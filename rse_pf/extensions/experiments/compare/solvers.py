@@ -1,6 +1,7 @@
-"""Who solves the poses of a comparison, and what that costs: the service in this process, or a platform.
+"""The solvers of pose queries for a comparison: the PnP service in this process, or a platform.
 
-Commands are encoded and decoded as on the wire in both cases, so that the numbers are the same.
+Both encode and decode commands as on the wire, so that poses and bytes are the same, and both measure their
+cost.
 """
 
 from __future__ import annotations
@@ -32,20 +33,24 @@ _ROBOT = "compare"
 
 
 class MeteredSolver(Protocol):
-    """Answers pose queries; counts bytes of commands and CPU seconds: of servers, and of those in here."""
+    """A solver of pose queries that counts what its answers cost.
+
+    ``sent_bytes`` are the bytes of all encoded commands, ``server_s`` the CPU seconds of the server's part,
+    and ``inside_s`` that part of ``server_s`` which was spent in this process.
+    """
 
     sent_bytes: int
     server_s: float
     inside_s: float
 
     async def ask(self, query: PoseQuery) -> PoseAnswer:
-        """Answer one query, or raise an RsePfError."""
+        """Return the pose that answers *query*; raises the RsePfError of a failure."""
 
 
 class InProcessSolver:
-    """Answers the pose queries of one run by the platform's own service, in this process; deterministic.
+    """Answers the pose queries of one run by the PnP service, in this process and deterministically.
 
-    Another run needs another solver: the bytes of a command depend on how many were before it.
+    Every run needs a new solver, because the bytes of a command depend on its number.
     """
 
     def __init__(self, settings: PlatformSettings) -> None:
@@ -57,7 +62,7 @@ class InProcessSolver:
         self._commands = 0
 
     async def ask(self, query: PoseQuery) -> PoseAnswer:
-        """Answer one query as `ask_robot` and a server do."""
+        """Encode *query* as the SDK does, decode and solve it as a server does, and return the pose."""
         self._commands += 1
         found = query.correspondences
         request = make_request(
@@ -86,7 +91,10 @@ class InProcessSolver:
 
 
 class PlatformSolver:
-    """Answers pose queries by the servers of a platform, and adds up what they say of their time."""
+    """Answers pose queries by the servers of a platform.
+
+    ``server_s`` sums the compute times in their answers.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self.sent_bytes = 0
@@ -95,7 +103,7 @@ class PlatformSolver:
         self._ask = ask_robot(robot.solve_pnp)
 
     async def ask(self, query: PoseQuery) -> PoseAnswer:
-        """Answer one query."""
+        """Return the pose with which a server answers *query*."""
         answer = await self._ask(query)
         self.sent_bytes += answer.payload_bytes
         self.server_s += answer.compute_ms / 1e3
@@ -104,7 +112,10 @@ class PlatformSolver:
 
 @asynccontextmanager
 async def platform_solver(settings: PlatformSettings, folder: Path) -> AsyncIterator[PlatformSolver]:
-    """Start a platform on this machine in *folder*, connect a robot, and end both afterwards."""
+    """Start a platform on this machine, connect a robot, and yield its solver; stop both after the block.
+
+    *folder* is the state folder of the platform, from which the keys are deleted.
+    """
     from client_sdk import connect
     from rse_pf.extensions.experiments.results.result_folder import remove_keys
     from rse_pf.local.control.platform import LocalPlatform

@@ -1,4 +1,4 @@
-"""One run of a configuration over a drive: its poses, their errors, and what they cost."""
+"""One run of a configuration on a drive: its poses, their errors, and their cost in bytes and CPU time."""
 
 from __future__ import annotations
 
@@ -23,17 +23,21 @@ from rse_pf.geometry import Array
 
 __all__ = ["TrackingRun", "longest_gap_s", "score", "track"]
 
+# Name of the robot in the keyframes of a run.
 _ROBOT = "compare"
+# Number of the first segment, the only one whose poses count for the errors of online poses.
 _FIRST = 0
+# Smallest number of poses for which errors are computed.
 _FEWEST = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackingRun:
-    """What one run gave.
+    """The result of one run.
 
-    ``figures`` follow from poses and messages alone, ``times_ms`` from the clock of the processor; None where
-    there is nothing to measure, with the reason in ``why``.  ``digest`` is that of all poses.
+    ``figures`` depend on poses and messages only, so that a deterministic run repeats them; ``times_ms`` are
+    CPU times.  ``errors`` is None if the poses cannot be compared with a truth, and ``why`` says the reason;
+    a figure without a value is None.  ``digest`` is a hash of all poses and their time stamps.
     """
 
     trajectory: Trajectory
@@ -47,7 +51,7 @@ class TrackingRun:
 
 @dataclass(slots=True)
 class _Costs:
-    """Of each frame: bytes, and CPU milliseconds of robot and server."""
+    """The cost of each frame, in the order of frames: bytes sent, and CPU time (ms) of robot and server."""
 
     sent_bytes: list[int] = field(default_factory=list)
     robot_ms: list[float] = field(default_factory=list)
@@ -60,9 +64,10 @@ async def track(
     solver: MeteredSolver,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> TrackingRun:
-    """Track all frames of *drive*, as fast as they can be, and return the poses at the end with their errors.
+    """Track all frames of *drive* as fast as possible, and return the final poses with their errors.
 
-    Without depth all keyframes are adjusted together at the end, as `Mapper.save` does.
+    *progress* is called with the number of tracked frames.  Without depth all keyframes are adjusted together
+    after the last frame, as `Mapper.save` does.
 
     Raises:
         UsageError: The recording cannot be read, or a function of the configuration fails.
@@ -91,7 +96,8 @@ async def track(
         try:
             done = await mapper.track(frame)
         except Exception as error:
-            # A slot says what a function returned wrongly; what it raised is the cause.
+            # The mapper raises an RsePfError for a user's function; the exception of the function is its
+            # cause.
             cause = error.__cause__ if isinstance(error, RsePfError) else error
             if not configuration.slots or cause is None:
                 raise
@@ -104,8 +110,9 @@ async def track(
         costs.robot_ms.append(1e3 * (took_s - (solver.inside_s - inside_s)))
         costs.server_ms.append(1e3 * (solver.server_s - server_s))
         if done.T_new_old is not None:
-            # A turned world is no error of the poses before: a robot turns what it has with it.
-            tracked = [(at_s, each, _turned(done.T_new_old, pose)) for at_s, each, pose in tracked]
+            # The mapper has rotated its world frame: the poses before are moved to the new frame, as a robot
+            # does.
+            tracked = [(at_s, segment, _moved(done.T_new_old, pose)) for at_s, segment, pose in tracked]
         tracked.append((frame.timestamp_s, done.segment, done.T_world_camera))
         progress(number)
     began_s = time.process_time()
@@ -115,12 +122,12 @@ async def track(
     return _run_of(mapper, report, drive, costs, tracked, finish_ms)
 
 
-def _turned(T_new_old: Array, pose: Array | None) -> Array | None:
+def _moved(T_new_old: Array, pose: Array | None) -> Array | None:
     return None if pose is None else T_new_old @ pose
 
 
 def longest_gap_s(stamps_s: Array, posed_s: Array) -> float:
-    """Return the longest time between two poses, or between a pose and the first or last frame."""
+    """Return the longest time (s) without a pose, within the time from the first to the last frame."""
     ends = np.concatenate([stamps_s[:1], posed_s, stamps_s[-1:]])
     return float(np.diff(ends).max(initial=0.0))
 
@@ -128,7 +135,7 @@ def longest_gap_s(stamps_s: Array, posed_s: Array) -> float:
 def score(
     estimate: Trajectory, drive: Drive, *, is_metric: bool, T_body_camera: Array | None = None
 ) -> tuple[Accuracy | None, str]:
-    """Return the errors of an estimate, or why there are none."""
+    """Return the errors of *estimate* against the truth of *drive* and "", or None and the reason."""
     truth = drive.dataset.truth
     if truth is None or len(truth) < 2:
         return None, "the recording has no truth: no ATE, no RPE"
@@ -188,7 +195,10 @@ def _run_of(
 
 
 def _keyframe_bytes(mapper: Mapper) -> float | None:
-    """Return the mean bytes of a keyframe in a map that is shared; None without depth, which shares none."""
+    """Return the mean size of an encoded keyframe in bytes.
+
+    None without depth, where maps are not encoded.
+    """
     try:
         return len(mapper.encoded_map()) / max(1, mapper.keyframes)
     except UsageError:

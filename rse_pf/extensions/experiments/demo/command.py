@@ -28,12 +28,13 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
 
+# Largest ``--robots``: every robot is a process.
 _MAX_ROBOTS = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoRequest(SensorRequest, CheckRequest):
-    """What robots drive through, how they track it, and what becomes of their maps."""
+    """Options of ``rse-pf demo``: the recording or rendered world, the tracking, and the use of the maps."""
 
     data: Path | None = option(
         "--data",
@@ -90,7 +91,10 @@ class DemoRequest(SensorRequest, CheckRequest):
 
 
 def demo(request: DemoRequest, settings: PlatformSettings) -> int:
-    """Check the options and run the demo."""
+    """Check the options and the recording, show the findings about it, and run the demo.
+
+    Return the exit code.
+    """
     robots = (
         request.robots
         if request.robots is not None

@@ -1,7 +1,7 @@
-"""The keyframes of a robot in the demo, and the map that it commits at the end.
+"""The keyframes of a robot in the demo, and the map that the robot commits at the end.
 
-Each keyframe is uploaded to the data service in a thread, and kept for the map.  A keyframe holds features
-and a pose, never an image.
+Each keyframe is uploaded to the data service in a thread, and stored in memory for the map.  A keyframe holds
+features and a pose, never an image.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 
 __all__ = ["KeyframeCollector", "KeyframeUploads"]
 
-_UPLOAD_TIMEOUT_S = 30.0  # how long the end of a drive waits for uploads of keyframes, in seconds
+_UPLOAD_TIMEOUT_S = 30.0  # longest wait for uploads of keyframes after the last frame, in seconds
 
 
 class KeyframeUploads:
-    """Upload the keyframes of a robot to the data service in a thread, and its map at the end."""
+    """Uploads a robot's keyframes to the data service in a thread, and the robot's map at the end."""
 
     def __init__(self, url: str, token: Callable[[], str]) -> None:
         """Describe the uploads to the data service at *url*; *token* returns a valid token of the robot."""
@@ -33,13 +33,13 @@ class KeyframeUploads:
         self._uploads: list[Future[str]] = []
 
     def keyframe(self, data: bytes) -> None:
-        """Upload an encoded keyframe after those before it, without waiting for the upload."""
+        """Queue the upload of an encoded keyframe, and return at once."""
         self._uploads.append(self._thread.submit(self._client.upload, data))
 
     def finish(self, robot: str, data: bytes) -> int:
-        """Wait for the keyframes, commit the map under the name of the robot, and close the connection.
+        """Wait up to 30 s for the uploads, commit *data* as the map named *robot*, and close the connection.
 
-        Return how many keyframes were uploaded.
+        Return the number of keyframes that were uploaded.
         """
         try:
             uploads, _ = wait(self._uploads, _UPLOAD_TIMEOUT_S)
@@ -51,7 +51,7 @@ class KeyframeUploads:
 
 
 class KeyframeCollector:
-    """Collects the keyframes of one robot."""
+    """Collects the keyframes of one robot, uploads them, and makes a map of them."""
 
     def __init__(
         self,
@@ -60,13 +60,14 @@ class KeyframeCollector:
         uploads: KeyframeUploads,
         features: FeaturesFunction | None = None,
     ) -> None:
-        """Start without keyframes.
+        """Describe the robot; there is no keyframe yet.
 
         Args:
-            robot: Name of the robot, which its keyframes carry.
-            options: Options of its tracker: features are extracted again with the same ones.
-            uploads: Takes each keyframe, encoded as a map of one, and the map.
-            features: Its features function; None for ORB.
+            robot: Name of the robot, which is stored in its keyframes.
+            options: Options of the robot's tracker, with which the features of a keyframe are extracted
+                again.
+            uploads: Uploads each keyframe, encoded as a map with one keyframe, and the complete map.
+            features: The robot's own function for features; None for ORB.
         """
         self._plugin = None if features is None else FeaturesPlugin(features)
         self._robot = robot
@@ -78,7 +79,7 @@ class KeyframeCollector:
         return len(self._keyframes)
 
     def add(self, tracked: TrackedFrame) -> None:
-        """Add *tracked* if it is a keyframe."""
+        """Add and upload the frame *tracked* if the tracker made it a keyframe and it has a pose."""
         if not tracked.keyframe or tracked.T_world_camera is None:
             return
         features = extract(tracked.frame, self._options, self._plugin)
@@ -97,7 +98,7 @@ class KeyframeCollector:
         self._uploads.keyframe(encode_map(MapVersion(keyframes=(keyframe,))))
 
     def encoded_map(self, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]) -> bytes:
-        """Return the robot's map with its cloud, ``(n, 3)`` metres and ``(n, 3)`` uint8."""
+        """Return the encoded map: all keyframes, and a cloud of points ``(n, 3)`` (m) with RGB ``(n, 3)``."""
         version = MapVersion(
             keyframes=tuple(self._keyframes),
             points=points,
@@ -106,6 +107,6 @@ class KeyframeCollector:
         )
         return encode_map(version)
 
-    def share(self, data: bytes) -> int:
-        """Upload the whole map, and return how many keyframes have arrived; raises RsePfError."""
+    def upload_map(self, data: bytes) -> int:
+        """Upload *data*, the encoded map; return the number of uploaded keyframes; raises RsePfError."""
         return self._uploads.finish(self._robot, data)

@@ -1,6 +1,6 @@
-"""The demo with --live: what each robot records, and how the parent fetches the map at the end.
+"""The demo with --live: the records of each robot, and the download of the published map at the end.
 
-Figures are computed from these records by `rse_pf.extensions.experiments.results.live_error`.
+`rse_pf.extensions.experiments.results.live_error` computes the figures from these records.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from rse_pf.extensions.experiments.results.live_error import LIVE_MAP, LIVE_RECO
 __all__ = ["LIVE_NAME", "LiveRecorder", "fetch_live_map", "show_live_map"]
 
 LIVE_NAME = "demo"
-"""Of the live map."""
+"""Name of the demo's live map."""
+# Deadline of the commands ``live-publish`` and ``live-show``, in seconds.
 _PUBLISH_S = 60.0
 
 
 class LiveRecorder:
-    """The records of one robot in a live map; times are seconds since the start of all robots."""
+    """Collects the records of one robot in a live map; their times are seconds since the robots started."""
 
     def __init__(self, mapper: LiveMapper, now: Callable[[], float], began: float) -> None:
-        """Record nothing yet; *now* is the clock of *mapper*, and *began* its reading at the start."""
+        """Describe the robot: *now* is the clock of *mapper* (s), *began* its time when the robots start."""
         self._mapper, self._now, self._began = mapper, now, began
         self._lines: list[dict[str, Any]] = []
         self._listening: asyncio.Task[None]
 
     def start(self) -> LiveRecorder:
-        """Begin to record corrections; return this object."""
+        """Start the task that records the corrections of the map; return this object."""
         self._listening = asyncio.create_task(self._listen())
         return self
 
     def frame(self, done: TrackedFrame) -> None:
-        """Record a frame with its poses as they were given out."""
+        """Record the tracked frame *done* with its poses in odometry frame and map, and the map's state."""
         self._lines.append(
             {
                 "event": "frame",
@@ -58,7 +59,10 @@ class LiveRecorder:
         )
 
     async def finish(self, folder: Path, truth: Trajectory | None) -> None:
-        """Write the records, and the truth beside them, after the robot has left the map."""
+        """Write the records, and *truth* if it is known, to *folder*.
+
+        Called after the robot has left the map.
+        """
         await self._listening
         self._lines.append({"event": "end", **self._mapper.report()["live"]})
         self._lines += [
@@ -95,7 +99,7 @@ class LiveRecorder:
 
 
 async def fetch_live_map(url: str, token: str, folder: Path, session: SessionSettings) -> str:
-    """Publish the live map, and keep the version in *folder*; return why there is none, if so."""
+    """Publish the live map and download the version to *folder*; return the error as text, empty if none."""
     from client_sdk import connect
 
     try:
@@ -108,7 +112,10 @@ async def fetch_live_map(url: str, token: str, folder: Path, session: SessionSet
 
 
 async def show_live_map(url: str, token: str, session: SessionSettings) -> dict[str, Any]:
-    """Return ``digest``, keyframes and log ``position`` of the map; or the ``trouble``."""
+    """Return digest, log position, number of keyframes, map server and epoch of the live map.
+
+    After an error the only member is ``trouble``, with its code and message.
+    """
     from client_sdk import connect
 
     try:

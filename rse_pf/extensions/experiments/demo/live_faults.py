@@ -1,8 +1,9 @@
-"""The faults of a demo with a live map: what is done to its platform while the robots drive, and when.
+"""The faults of a demo with a live map, injected into its platform while the robots drive.
 
-The moment of the fault is drawn from a seed.  Each change of the map's lease is recorded as it is seen in the
-store, every 20 ms; figures are computed from these records by
-`rse_pf.extensions.experiments.results.live_faults`."""
+The time of the fault is drawn with a seed.  The lease of the map in the object store is read every 20 ms, and
+each change of it is recorded as an event; `rse_pf.extensions.experiments.results.live_faults` computes
+figures from these events.
+"""
 
 from __future__ import annotations
 
@@ -33,53 +34,70 @@ __all__ = ["LIVE_FAULTS", "Disturbance", "LiveFault"]
 LIVE_FAULTS = {
     "none": 0.0, "kill": 0.0, "stop": 10.0, "drain": 0.0, "roll": 0.0, "store": 10.0, "wifi": 30.0
 }  # fmt: skip
-"""Every fault by its name on the command line, and its duration in seconds."""
+"""Every fault of a live map by its name in ``--only``, and its duration in seconds.
+
+0 for one without a duration.
+"""
+# Percentage of the operations of the object store that fail during the fault "store".
 _FAILING_PERCENT = 30.0
-_EARLIEST, _LATEST = 0.16, 0.5
-"""The moment of a fault as a share of the drive; a long fault begins in the first half of this."""
+# Earliest time of a fault, as a fraction of the drive.
+_EARLIEST = 0.16
+# Latest time of a fault, as a fraction of the drive; a long fault begins in the first half of the interval.
+_LATEST = 0.5
+# A fault that lasts for more than this many seconds is a long one.
 _LONG_S = 20.0
+# Time between two reads of the map's lease, in seconds.
 _WATCH_S = 0.02
+# Longest wait until a server serves the map, in seconds.
 _OWNER_S = 20.0
+# Number (from 0) of the robot whose link the fault "wifi" cuts.
 _CUT_ROBOT = 0
+# During the fault "wifi", a robot solves a pose itself if the cloud has not answered within this time, in
+# seconds.
 _OFFLINE_ANSWER_S = 0.5
-"""A robot whose Wi-Fi may fail answers itself after this."""
 
 Log = Callable[..., None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveFault:
-    """One fault of `LIVE_FAULTS`; *seed* draws its moment, and ``speed`` shortens what lasts."""
+    """One fault of `LIVE_FAULTS`; ``seed`` determines the time at which it is injected."""
 
     name: str
     seed: int = 0
 
     @property
     def has_offload(self) -> bool:
-        """Whether the robots solve poses themselves where the cloud does not answer, and keep keyframes."""
+        """Whether robots solve poses themselves if the cloud does not answer, and store keyframes on disk."""
         return self.name == "wifi"
 
     def settings(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return the settings of the platform: the whole log is kept, for its replay."""
+        """Return *settings* changed for this fault: the map's log is never shortened.
+
+        So it can be replayed.
+        """
         changed = settings.replace(live={"keep_log": True})
         return (
             changed.replace(session={"answer_timeout_s": _OFFLINE_ANSWER_S}) if self.has_offload else changed
         )
 
     def moment_s(self, drive_s: float) -> float:
-        """Return when the fault comes in a drive of *drive_s*."""
+        """Return the time at which the fault begins in a drive of *drive_s*; both in seconds."""
         latest = (_EARLIEST + _LATEST) / 2 if LIVE_FAULTS[self.name] > _LONG_S else _LATEST
         return drive_s * random.Random(self.seed).uniform(_EARLIEST, latest)
 
     @contextlib.contextmanager
     def environment(self, folder: Path) -> Any:
-        """Start the platform inside this block: its store can fail then."""
+        """Set up the environment in which the platform must be started; for "store", its stores can fail."""
         with failing_environment(folder) if self.name == "store" else contextlib.nullcontext():
             yield
 
     @contextlib.asynccontextmanager
     async def disturb(self, platform: LocalPlatform, store: Path, log: Log) -> AsyncIterator[Disturbance]:
-        """Watch the lease of the map in the platform's objects; yield what begins and ends the fault."""
+        """Record the changes of the map's lease, and yield the object that injects the fault.
+
+        *store* is the folder of the demo; *log* records an event.
+        """
         async with AsyncExitStack() as stack:
             link = None
             if self.name == "wifi":
@@ -96,7 +114,7 @@ class LiveFault:
 
 
 class Disturbance:
-    """A fault in a running demo."""
+    """Injects a fault into a running demo, and records the changes of the map's lease."""
 
     def __init__(
         self, fault: LiveFault, platform: LocalPlatform, folder: Path, link: LinkProcess | None, log: Log
@@ -109,26 +127,32 @@ class Disturbance:
         self._acting: asyncio.Task[None] | None = None
 
     def watch(self) -> None:
-        """Begin to watch the lease of the map."""
+        """Start the task that records the changes of the map's lease."""
         self._watching = asyncio.create_task(self._watch())
 
     def url_of(self, robot: int) -> str:
-        """Return where *robot* 0, 1, ... connects."""
+        """Return the address for the robot of number *robot* (from 0).
+
+        One leads through the link that is cut.
+        """
         if self._link is None or robot != _CUT_ROBOT:
             return self._platform.url
         return urlsplit(self._platform.url)._replace(netloc=f"127.0.0.1:{self._link.port}").geturl()
 
     def begin(self, start_after_s: float, drive_s: float) -> None:
-        """Let the fault come at its moment; the robots start after *start_after_s*."""
+        """Start the task that injects the fault at its time.
+
+        The robots start in *start_after_s* seconds and drive for *drive_s* seconds.
+        """
         self._acting = asyncio.create_task(self._act(start_after_s + self._fault.moment_s(drive_s)))
 
     async def finish(self) -> None:
-        """Wait until the fault is over; raises what injecting it raised."""
+        """Wait until the fault is over; an error of its injection is raised."""
         if self._acting is not None:
             await self._acting
 
     async def end(self) -> None:
-        """Stop all that is done here."""
+        """Cancel the tasks that inject the fault and record the lease."""
         tasks = [task for task in (self._watching, self._acting) if task is not None]
         for task in tasks:
             task.cancel()
@@ -164,7 +188,7 @@ class Disturbance:
         self._log("fault-over", fault=name)
 
     async def _stop(self, owner: LeaseRecord, what: dict[str, Any]) -> None:
-        """Stop all processes of the owner's server, the owner among them, and let them go on."""
+        """Stop all processes of the server that serves the map by SIGSTOP; continue them after the fault."""
         server = next(candidate for candidate in self._platform.servers if candidate.name == owner.server)
         self._log("fault", **what, owner=owner.owner, server=owner.server)
         stopped = signal_tree(server.mark, signal.SIGSTOP)
@@ -183,7 +207,11 @@ class Disturbance:
             set_failing_percent(folder, 0.0)
 
     async def _owner(self) -> LeaseRecord:
-        """Return who owns the map, once somebody does."""
+        """Wait until a map server serves the map, and return its lease.
+
+        Raises:
+            CommandFailed: There was none within 20 s.
+        """
         for _ in range(round(_OWNER_S / _WATCH_S)):
             if self._lease is not None and self._lease.state == "serving":
                 return self._lease
@@ -191,7 +219,7 @@ class Disturbance:
         raise CommandFailed("no server owns the live map", hint="let the robots drive for longer")
 
     async def _watch(self) -> None:
-        """Record each change of the lease but for its renewals."""
+        """Record each change of the lease's holder or state, until cancelled; renewals are not recorded."""
         name = lease_name(DEFAULT_TENANT, LIVE_NAME)
         while True:
             with contextlib.suppress(NotFound, RsePfError):

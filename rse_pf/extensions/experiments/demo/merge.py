@@ -1,9 +1,9 @@
-"""The end of a demo with --merge: the maps of the robots become one map, with its figure, cloud and errors.
+"""The end of a demo with --merge: the maps of the robots are merged into one, which is drawn and evaluated.
 
-Every robot has committed its map to the data service.  The parent fetches them, stores them under its own
-name, calls ``merge`` with their digests (a job on a backend server), and commits the result as a map that all
-robots of the tenant may read.  The maps of the robots stay as they are, and a map that could not be joined is
-not drawn.
+Every robot has committed its map to the data service.  The parent process downloads the maps, stores each as
+an object of its own, calls the service ``merge`` with their digests (a job on a backend server), and commits
+the result as a map that all robots of the tenant may read.  The maps of the robots are not changed, and a map
+that could not be joined is not drawn.
 """
 
 from __future__ import annotations
@@ -38,10 +38,15 @@ __all__ = [
 MAP_FILE = "map.rsemap"
 """Name of a robot's map in its folder, encoded by `rse_pf.maps.format.encode_map`."""
 MERGED_MAP = "merged.rsemap"
+"""Name of the file with the merged map, in the folder of the demo."""
 MERGED_NAME = "merged"
+"""Name under which the merged map is committed to the data service."""
 
 MergeMaps = Callable[[Sequence[bytes]], tuple[MergeReply, dict[str, Any]]]
-"""Merges encoded maps; returns the reply of ``merge``, and what the report says about the call."""
+"""Function that merges encoded maps.
+
+Returns the reply of ``merge``, and members for the report about the call.
+"""
 
 
 def write_merged(
@@ -51,7 +56,7 @@ def write_merged(
     truths: Sequence[Trajectory | None],
     merge: MergeMaps,
 ) -> dict[str, Any]:
-    """Merge the maps in the folders of the robots, write the results, and return ``merged`` of the report.
+    """Merge the maps in the folders of the robots, write the results, and return the report's section.
 
     Writes ``merged.rsemap``, ``merged.ply``, ``map_merged.png``, and ``merged_trajectory.txt`` in the folder
     of every robot that was joined.
@@ -105,13 +110,16 @@ def merge_on_platform(
     session: SessionSettings,
     progress: Callable[[float, str], None],
 ) -> tuple[MergeReply, dict[str, Any]]:
-    """Merge the maps *names* of the registry on the platform at *url*; blocks until it is done.
+    """Merge the committed maps *names* on the platform at *url*; block until the result is committed.
+
+    *progress* is called with the completed fraction of the job (0 to 1) and its phase.
 
     Returns:
-        The reply of the service, and for the report the server, the seconds and the id of the map.
+        The reply of the service, and for the report the server, the durations in seconds and the map's
+        version.
 
     Raises:
-        RsePfError: The typed failure of a transfer or of the job.
+        RsePfError: A transfer or the job failed.
     """
     data = DataClient(url, token)
     try:
@@ -138,7 +146,7 @@ def merge_on_platform(
 
 
 def commit(data: DataClient, name: str, encoded: bytes, note: str) -> str:
-    """Make *encoded* the next version of map *name*; return its id."""
+    """Commit *encoded* as the next version of the map *name* with *note*; return the id of the version."""
     try:
         parent: str | None = data.map_version(name)["id"]
     except NotFound:
@@ -147,9 +155,9 @@ def commit(data: DataClient, name: str, encoded: bytes, note: str) -> str:
 
 
 def print_tenths(say: Callable[[str], None]) -> Callable[[float, str], None]:
-    """Return a progress callback that prints a line for every tenth, and never a smaller one than before.
+    """Return a progress callback that prints a line whenever another tenth of the job is completed.
 
-    A job that another server starts again prints nothing until it is as far as it was.
+    A job that is restarted on another server prints nothing until it is further than before.
     """
     reached = -1
 

@@ -1,4 +1,4 @@
-"""The demo's report: figures from the records, beside the paper's, as JSON and Markdown."""
+"""The demo's report as JSON and Markdown: figures from the records, compared with those of the paper."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from rse_pf.terminal import counted
 
 __all__ = ["advice", "closing_lines", "demo_page", "is_lost", "make_report"]
 
+# Fraction of lost frames from which on the demo prints advice.
 _SOME = 0.1
-"""Share of lost frames from which the demo says what helps."""
+# Fraction of frames without a pose above which a run has failed.
 _MOST = 0.5
-"""Share of lost frames above which a run has failed."""
 
 
 def make_report(
@@ -33,7 +33,11 @@ def make_report(
     before: Mapping[str, Any],
     load_average_after: Sequence[float],
 ) -> dict[str, Any]:
-    """Return ``report.json``; ``ate_cm`` and ``rpe_cm`` are lists in the order of the robots."""
+    """Return the content of ``report.json``.
+
+    ``ate_cm``, ``rpe_cm`` and other figures of robots are lists in the order of *finished*.  *asked* are the
+    options, *before* is the environment before the run.
+    """
     errors = [_errors(robot) for robot in finished]
     names = ("ate_cm", "rpe_cm", "rpe_deg", "ate_percent_of_path", "path_m")
     accuracy = {name: [error[name] for error in errors] for name in names}
@@ -63,7 +67,7 @@ def make_report(
 
 
 def demo_page(report: Mapping[str, Any]) -> str:
-    """Return ``report.md``."""
+    """Return the text of ``report.md`` for *report*."""
     paper, about, commands = report["paper"], report["environment"], report["commands"]
     trip, compute, payload = report["round_trip_ms"], report["compute_ms"], report["payload_bytes"]
     rows = [
@@ -96,7 +100,10 @@ def demo_page(report: Mapping[str, Any]) -> str:
 
 
 def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str] = ()) -> str:
-    """Return what the terminal shows at the end, without doubts that were *shown*; files come last."""
+    """Return the text that the terminal shows at the end; the files of results in *folder* are named last.
+
+    Findings about a recording that are in *shown* were printed before, and are left out.
+    """
     trip, commands = report["round_trip_ms"], report["commands"]
     times = f"round trip p50 {trip['p50']} ms, p99 {trip['p99']} ms"
     first = (
@@ -136,7 +143,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
 
 
 def is_lost(report: Mapping[str, Any]) -> bool:
-    """Return whether a command got no answer, or most frames got no pose."""
+    """Return whether a command got no final answer, or more than half of the frames got no pose."""
     return bool(report["commands"]["lost"] > 0 or _without_pose(report) > _MOST * report["frames"])
 
 
@@ -145,7 +152,10 @@ def _without_pose(report: Mapping[str, Any]) -> int:
 
 
 def advice(report: Mapping[str, Any]) -> str:
-    """Return a line that says what helps if many frames were lost, with its newline; else nothing."""
+    """Return a line of advice, with a newline, if at least a tenth of the frames was lost.
+
+    Else an empty text.
+    """
     asked = report["asked"]
     if report["lost_frames"] < _SOME * report["frames"] or not report["lost_frames"]:
         return ""
@@ -160,7 +170,7 @@ def _robots(numbers: Sequence[int]) -> str:
 
 
 def _errors(robot: RobotFinished) -> dict[str, float | None]:
-    """Return the errors and the length of a path; a path in a unit of its own has neither."""
+    """Return the errors and the length of the robot's path; all are None if its unit is unknown."""
     names = ("ate_cm", "rpe_cm", "rpe_deg", "ate_percent_of_path", "path_m")
     if not robot.is_metric:
         return dict.fromkeys(names)

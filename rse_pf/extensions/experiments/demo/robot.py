@@ -1,7 +1,7 @@
 """One robot of the demo, in a process of its own: it tracks frames and writes its map and its records.
 
-Like a user's robot it uses the public SDK and a token, and nothing of the platform.  It writes its files even
-if frames were lost.
+As a user's robot does, it uses the public SDK and a token, and no code of the platform.  It writes its files
+even if frames were lost.
 """
 
 from __future__ import annotations
@@ -43,20 +43,25 @@ if TYPE_CHECKING:
 
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
 
+# Niceness of the processes of robots: they share the machine with the servers, which must have priority.
 _ROBOT_NICE = 5
-"""Robots of the demo share a machine with the servers, which go first; elsewhere a robot has its own."""
+# Smallest number of measurements of a point that is written to the cloud.
 _MIN_READINGS = 2
+# A robot that may solve poses itself begins this long before the deadline of a command, in seconds; the time
+# is long because all robots and servers share one machine.
 _OWN_SOLVER_S = 0.2
-"""A robot whose cloud does not answer begins so long before the deadline: it shares the machine with all."""
+# Frames per robot in the rendered world.
 _DEFAULT_FRAMES = 80
+# Smallest number of frames per robot in the rendered world whose maps are merged.
 _LEAST_MERGE_FRAMES = 150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
-    """Options of the command line.
+    """Options of the demo.
 
-    ``data`` None means the rendered world; ``camera`` and ``imu`` None mean what the recording has.
+    ``data`` None means the rendered world; ``camera`` and ``imu`` None mean the sensors that the recording
+    has.
     """
 
     data: Path | None = None
@@ -75,15 +80,19 @@ class DemoOptions:
     live: bool = False
     quiet: bool = False
     check: bool = False
-    """Whether drives of a recording are checked."""
+    """Whether the drive of each robot over a recording is checked, as by ``rse-pf check``."""
     accepted: tuple[str, ...] = ()
-    """Names of doubts about the recording that the user takes for right."""
+    """Names of findings about the recording that the user accepts (``--accept``)."""
     shown: tuple[str, ...] = ()
-    """Lines of doubts about the recording that the user has seen before the drive."""
+    """Lines of findings about the recording that were printed before the drive."""
 
     @property
     def frame_count(self) -> int:
-        """The frames of each robot in the rendered world; to merge, it must see what the next one saw."""
+        """The number of frames of each robot in the rendered world.
+
+        With --merge or --live the default is so large that each robot also sees a part of the next robot's
+        path.
+        """
         from client_sdk.simulator import frames_to_overlap
 
         if self.frames or not (self.merge or self.live):
@@ -91,7 +100,10 @@ class DemoOptions:
         return max(_LEAST_MERGE_FRAMES, frames_to_overlap(self.robots))
 
     def share(self, robot: int) -> Dataset:
-        """Return the frames of the recording that *robot* 0, 1, ... plays; raises UsageError."""
+        """Return the part of the recording that the robot of number *robot* (from 0) plays.
+
+        Raises UsageError.
+        """
         from client_sdk.datasets import open_dataset
 
         assert self.data is not None
@@ -100,7 +112,7 @@ class DemoOptions:
 
     @property
     def frontend_options(self) -> FrontEndOptions:
-        """The options of the trackers."""
+        """The options of the robots' trackers."""
         wide = self.frontend == "wide-baseline"
         standard = FrontEndOptions.live() if self.live else FrontEndOptions()
         options = FrontEndOptions.wide_baseline() if wide else standard
@@ -109,7 +121,10 @@ class DemoOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotSpec:
-    """What one robot needs besides the options of the demo."""
+    """The description of one robot for its process.
+
+    ``number`` counts from 0, ``folder`` is that of its files.
+    """
 
     name: str
     number: int
@@ -118,21 +133,21 @@ class RobotSpec:
     options: DemoOptions
     session: SessionSettings
     has_offload: bool = False
-    """Whether it solves poses itself where the cloud does not answer, and keeps keyframes on its disk."""
+    """Whether the robot solves poses itself if the cloud does not answer, and stores keyframes on disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameDone:
-    """From the robot: a frame was loaded or, after the start, tracked."""
+    """Message of a robot to its parent: ``frames`` frames were rendered or, after the start, tracked."""
 
     frames: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotFinished:
-    """From the robot: its figures at the end; its map and trajectory are in its folder.
+    """Last message of a robot to its parent: its figures; its map and trajectory are in its folder.
 
-    Without *is_metric* the trajectory is in a unit of its own.
+    If ``is_metric`` is False, the unit of the trajectory is unknown.
     """
 
     frames: int
@@ -148,18 +163,18 @@ class RobotFinished:
     truth: Trajectory | None
     truth_kind: str
     frames_before_start: int = 0
-    """Frames of a camera without depth before it had moved enough."""
+    """Number of frames before the first pose: a camera without depth must move first."""
     not_started_because: str = ""
-    """Why a camera without depth has no pose at all; empty if it has."""
+    """Why a robot with a camera without depth has no pose at all; empty if it has one."""
     stats: dict[str, Any] = field(default_factory=dict)
     is_metric: bool = True
     check: dict[str, Any] | None = None
-    """What the check of the drive found; None if there was none."""
+    """The result of the check of the drive; None if the drive was not checked."""
 
 
 @dataclass(slots=True)
 class _Drive:
-    """The records of the robot while it drives."""
+    """The records of the robot while it drives: its commands, tracked frames, and number of weak poses."""
 
     commands: list[CommandRecord] = field(default_factory=list)
     tracked: list[TrackedFrame] = field(default_factory=list)
@@ -168,7 +183,10 @@ class _Drive:
 
 @dataclass(frozen=True, slots=True)
 class _Loaded:
-    """Frames to play, with the truth of them."""
+    """The frames that a robot plays, with their truth.
+
+    ``is_thinned`` if frames of the recording are skipped.
+    """
 
     frames: Any
     truth: Trajectory | None
@@ -179,7 +197,10 @@ class _Loaded:
 
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
-    """Load the frames, connect, wait for the start, track; the entry point of the process."""
+    """Load the frames, connect, wait for the start, track all frames and report; entry point of the process.
+
+    An error is sent to the parent as `ChildFailed`.
+    """
     os.nice(_ROBOT_NICE)
     parent = ParentPipe(pipe, spec.name)
     parent.listen()
@@ -240,7 +261,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
             for row in range(len(frames)):
                 frame: Frame | None = await following
-                if frame is None:  # damaged images are left out
+                if frame is None:  # the recording skips damaged images, so that there may be fewer frames
                     break
                 planned = began + (row + spec.number / options.robots) / options.rate_hz
                 await asyncio.sleep(max(0.0, planned - time.monotonic()))
@@ -289,21 +310,27 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
 def _checked(
     check: DriveCheck, mapper: Mapper | LiveMapper, loaded: _Loaded, accepted: Sequence[str]
 ) -> dict[str, Any] | None:
-    """Return what is wrong with the drive.  Its files are written: pairs may be adjusted."""
+    """Return the result of *check*; None if no check is wanted.
+
+    The keyframes of *mapper* may be changed, so this is called after the files of the robot were written.
+    """
     offsets = mapper.adjust_pairs() if check.is_wanted and isinstance(mapper, Mapper) else {}
     reference = MotionReference.of_truth(loaded.truth, loaded.truth_kind, is_camera=False)
     return check.finish(reference, offsets, unresolved(loaded.log.doubts, accepted), accepted)
 
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:
-    """Return whether poses of the odometry are metres; those of one lens in a live map never are."""
+    """Return whether the odometry is in metres; that of a camera without depth in a live map never is."""
     return mapper.scale.startswith("metric") and getattr(mapper, "metres_per_unit", 1.0) == 1.0
 
 
 async def _solve(
     robot: Robot, query: PoseQuery, planned: float, began: float, spec: RobotSpec, drive: _Drive
 ) -> PoseAnswer:
-    """Request one pose from the platform, and record how that went."""
+    """Request the pose of *query* from the platform, record the command in *drive*, and return the answer.
+
+    A failure is recorded and raised.
+    """
     sent = time.monotonic()
     record = CommandRecord(
         id=len(drive.commands) + 1,
@@ -343,7 +370,7 @@ def _since(began: float) -> float:
 
 
 def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
-    """Return the frames and the truth; the world is rendered before the start."""
+    """Open the robot's part of the recording, or render its frames, and return frames and truth."""
     options, number = spec.options, spec.number
     if options.data is not None:
         recording = options.share(number)
@@ -372,7 +399,10 @@ def _collector(spec: RobotSpec, token: Callable[[], str]) -> KeyframeCollector |
 def _write(
     folder: Path, mapper: Mapper | LiveMapper, trajectory: Trajectory, collector: KeyframeCollector | None
 ) -> int:
-    """Write the files of the robot, upload its map, and return how many keyframes were uploaded."""
+    """Write cloud and trajectory of the robot; with *collector* also write and upload its map.
+
+    Return the number of keyframes that were uploaded, 0 without *collector*.
+    """
     points, colours = mapper.map.points(min_readings=_MIN_READINGS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(
@@ -385,4 +415,4 @@ def _write(
         return 0
     data = collector.encoded_map(points, colours)
     (folder / MAP_FILE).write_bytes(data)
-    return collector.share(data)
+    return collector.upload_map(data)

@@ -1,7 +1,8 @@
 """The demo: robots build point-cloud maps through the PnP service, on one machine.
 
-Starts the local platform (real servers behind a real load balancer), runs every robot as a process, and
-writes maps, trajectories, figures and a report.  Everything that it started has ended when it returns.
+`run_demo` starts the local platform (real servers behind a real load balancer), runs every robot as a
+process, and writes maps, trajectories, figures and a report.  Every process that it started has exited when
+it returns.
 """
 
 from __future__ import annotations
@@ -69,15 +70,18 @@ __all__ = ["DemoOptions", "run_demo"]
 
 T = TypeVar("T")
 
+# Time after which the process of a robot that has finished and does not exit is killed, in seconds.
 _EXIT_TIMEOUT_S = 5.0
+# Time between the order to start and the start of the robots, in seconds.
 _START_S = 0.2
+# Time between the order to start and the start with a live map, in seconds: the map server starts and robots
+# join.
 _LIVE_START_S = 3.0
-"""Robots join a live map when they are switched on, and drive a moment later; a server starts its owner."""
 
 
 @dataclass(slots=True, kw_only=True)
 class _Robot:
-    """The process of a robot, in its parent."""
+    """What the parent knows about the process of a robot; ``bar`` is its progress bar."""
 
     spec: RobotSpec
     process: Any
@@ -87,9 +91,9 @@ class _Robot:
 
 
 def run_demo(options: DemoOptions, settings: PlatformSettings, fault: LiveFault | None = None) -> int:
-    """Run the demo, with a fault of a live map if there is one; return 0 if most frames have poses.
+    """Run the demo, inject *fault* if given, write results to ``options.out``, and print the main figures.
 
-    It returns 1, too, if a command neither was answered nor failed.
+    Return 1 if a command got no final answer, or if more than half of the frames got no pose; else 0.
     """
     folder = fresh_folder(
         options.out,
@@ -214,7 +218,10 @@ async def _follow(
     now: Callable[[], float],
     disturbance: Disturbance | None,
 ) -> None:
-    """Wait until all robots are ready, start them together, and follow them to their end."""
+    """Wait until all robots are ready, start them at the same time, and wait until all have finished.
+
+    The fault of *disturbance* is injected while they drive.
+    """
     inboxes = [_messages(robot.pipe) for robot in robots]
     ready = await asyncio.gather(
         *(_wait_for(ChildReady, *pair, platform, screen) for pair in zip(robots, inboxes, strict=True))
@@ -240,7 +247,11 @@ async def _follow(
 async def _wait_for(
     kind: type[T], robot: _Robot, inbox: AsyncIterator[Any], platform: LocalPlatform, screen: Progress
 ) -> T:
-    """Handle the messages of *robot* until one of *kind* comes, and return that."""
+    """Handle the messages of *robot* until one of type *kind* arrives, and return that message.
+
+    Raises:
+        CommandFailed: The robot failed, or its process exited.
+    """
     async for message in inbox:
         if isinstance(message, kind):
             return message
@@ -277,7 +288,7 @@ async def _messages(pipe: Connection) -> AsyncIterator[Any]:
 
 
 async def _sample(platform: LocalPlatform, path: Path, now: Callable[[], float]) -> None:
-    """Write the status of the servers twice per second."""
+    """Write the status of the servers to the CSV file *path* twice per second, until cancelled."""
     with path.open("w", encoding="utf-8") as file:
         file.write("time,server,pid,robots,requests,queue,in_flight,cpu_s\n")
         while True:
@@ -303,7 +314,7 @@ def _merge(
     platform: LocalPlatform,
     screen: Progress,
 ) -> dict[str, Any]:
-    """Merge the maps that the robots have committed, on the platform."""
+    """Merge the maps that the robots have committed, on the platform; return the figures for the report."""
     names = [_name(number) for number in range(len(finished))]
     url, token = platform.url, platform.issue_token("operator")
     section = write_merged(
@@ -357,7 +368,8 @@ def _write_results(
     for path, (points, colours), robot in zip(paths, clouds, finished, strict=True):
         caption = f"{path.name}: {robot.frames} frames, {robot.lost_frames} lost, {len(points):,} points"
         draw_map(folder / path.name / "map.png", points, colours, [path], caption)
-    # Robots that merge, or share a live map, start in world frames of their own: their clouds do not fit.
+    # With --merge or --live each robot starts in a world frame of its own: their clouds cannot be drawn
+    # together.
     in_one_frame = not options.merge and not options.live
     if len(paths) > 1 and in_one_frame and all(robot.truth is not None for robot in finished):
         points = np.concatenate([points for points, _ in clouds])
@@ -368,7 +380,7 @@ def _write_results(
 
 
 def _draw_live_map(folder: Path, version: MapVersion) -> None:
-    """Draw the cloud of a live map, and its robots' keyframes as their paths."""
+    """Draw ``map.png``: the cloud of a live map, with the poses of each robot's keyframes as its path."""
     by_robot: dict[str, list[Array]] = {}
     for keyframe in version.keyframes:
         by_robot.setdefault(keyframe.robot, []).append(keyframe.T_world_camera)
@@ -378,7 +390,7 @@ def _draw_live_map(folder: Path, version: MapVersion) -> None:
 
 
 def _progress_bars(quiet: bool) -> Progress:
-    """Return a progress bar per robot below the lines of text, or nothing if *quiet*."""
+    """Return the display of progress bars below lines of text; with *quiet* it prints nothing."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -1,4 +1,4 @@
-"""Faults on purpose: kill, pause or slow a server, and emulate a network link.
+"""Fault injection: kill, pause, slow down or cut off a server, let a store fail, and emulate a network link.
 
-Only what experiments and `rse-pf local` inject belongs here; nothing else imports this package at run time.
+Only experiments and the commands of ``rse-pf local`` that inject faults use this package.
 """

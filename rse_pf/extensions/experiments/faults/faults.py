@@ -1,8 +1,9 @@
 """Inject faults into a running platform: kill, stop, slow down or cut off one of its processes.
 
-Needs only the state file, so it works while the control plane is dead.  Only processes whose id and start
-time are in that file, and their children, are signalled.  A server that was slowed or cut off is whole again
-when the call ends, also if this process is killed inside `cut_off`.
+The functions need only the state file of the platform, so that they work while its control plane is not
+running. They signal only processes whose id and start time are in that file, and the children of those.  A
+server that was slowed down or cut off works again when the call returns; the network rules of `cut_off` are
+removed even if this process is killed.
 """
 
 from __future__ import annotations
@@ -35,11 +36,17 @@ __all__ = [
 ]
 
 PERIOD_S = 0.04
-"""One round of stopping and going on: long against a switch of processes, short against a health check."""
+"""Seconds of one cycle of stopping and continuing a slowed server.
+
+It is long compared with a context switch and short compared with the interval of health checks."""
 
 
 def find_server(state: PlatformState, name: str) -> ServerState:
-    """Return the running server called *name*; raises UsageError, which names those that run."""
+    """Return the running server called *name*.
+
+    Raises:
+        UsageError: No server of this name is running; the hint names those that are.
+    """
     alive = [server for server in (*state.servers, *state.single_servers) if is_alive(server.process)]
     for server in alive:
         if server.name == name:
@@ -49,9 +56,9 @@ def find_server(state: PlatformState, name: str) -> ServerState:
 
 
 def longest_pause_s(state: PlatformState, server: ServerState, health: HealthSettings) -> float:
-    """Return for how long *server* may be stopped before the control plane may replace it, in seconds.
+    """Return for how many seconds *server* may be stopped before the control plane may replace it.
 
-    Without a control plane nothing is replaced: infinite.
+    The result is infinite if no control plane is running, since then no server is replaced.
     """
     if not is_alive(state.control_plane):
         return math.inf
@@ -60,9 +67,9 @@ def longest_pause_s(state: PlatformState, server: ServerState, health: HealthSet
 
 
 def tree(root: ProcessMark) -> list[ProcessMark]:
-    """Return *root* and every process that it or its children started, parents first; empty if it is gone."""
+    """Return *root* and all its running descendants, parents before children; empty if *root* has exited."""
     marks, pids = [root] if is_alive(root) else [], {root.pid}
-    for mark in marks:  # grows while it is walked
+    for mark in marks:  # the loop appends children to the list that it iterates over
         for pid in _children(mark.pid):
             child = mark_of(pid)
             if child is not None and pid not in pids:
@@ -72,9 +79,10 @@ def tree(root: ProcessMark) -> list[ProcessMark]:
 
 
 def signal_tree(root: ProcessMark, number: signal.Signals) -> int:
-    """Signal *root* and all that it started; return how many there were.
+    """Send signal *number* to *root* and all its descendants.
 
-    Looks again until nothing new was found: a process may start another one before it is stopped.
+    Return the number of processes that were signalled.
+    The search is repeated until it finds no further process: one may start another before it is stopped.
     """
     signalled: set[ProcessMark] = set()
     while new := [mark for mark in tree(root) if mark not in signalled]:
@@ -85,7 +93,7 @@ def signal_tree(root: ProcessMark, number: signal.Signals) -> int:
 
 
 def kill_balancer(state: PlatformState) -> int:
-    """End the load balancer with SIGKILL; return its pid, or raise UsageError if none runs."""
+    """Kill the load balancer with SIGKILL and return its pid; raises UsageError if none is running."""
     mark = state.load_balancer
     if mark is None or not send_signal(mark, signal.SIGKILL):
         raise UsageError("no load balancer is running", hint="rse-pf local status shows what runs")
@@ -93,12 +101,19 @@ def kill_balancer(state: PlatformState) -> int:
 
 
 def slow_down(root: ProcessMark, percent: float, wait: Callable[[float], bool]) -> None:
-    """Give *root* and all that it started *percent* of the time, until it is gone or *wait* returns True.
+    """Let *root* and its descendants run only *percent* of the time, until *wait* returns True.
+
+    The call returns earlier if *root* exits.
+    The processes are stopped and continued by signals in cycles of `PERIOD_S`; they run when the call
+    returns.
 
     Args:
-        root: A server.
-        percent: Above 0, below 100.
-        wait: Waits so many seconds, or shorter; returns whether it is over.
+        root: The process of a server.
+        percent: Part of each cycle in which the processes run; above 0, below 100.
+        wait: Waits for the given number of seconds or less; returns True to end the slow-down.
+
+    Raises:
+        UsageError: *percent* is out of range.
     """
     if not 0 < percent < 100:
         raise UsageError(f"a server cannot have {percent:g} % of its time", hint="choose 1 to 99")
@@ -115,13 +130,14 @@ def slow_down(root: ProcessMark, percent: float, wait: Callable[[float], bool]) 
 
 @contextlib.contextmanager
 def cut_off(server: ServerState, platform: str) -> Iterator[None]:
-    """Drop everything to and from the ports of *server* on the loopback interface, inside the block.
+    """Drop all TCP packets to and from the ports of *server* on the loopback interface, inside the block.
 
-    The rules are in a table that belongs to a child of ours: Linux removes it with its owner.
+    The nftables rules are in a table that is owned by a child process of this one: Linux removes the table
+    when the child exits.
 
     Raises:
-        UsageError: We are not root.
-        ConfigurationError: There is no ``nft``, or it refuses.
+        UsageError: This process does not run as root.
+        ConfigurationError: ``nft`` is not installed, or rejects the rules.
     """
     if os.geteuid() != 0:
         hint = f"nearest without root: rse-pf local pause {server.name}"
@@ -146,7 +162,11 @@ def cut_off(server: ServerState, platform: str) -> Iterator[None]:
 
 
 def nft_commands(table: str, ports: Sequence[int]) -> str:
-    """Return what makes *table* drop TCP to and from *ports* of this machine; it ends with its owner."""
+    """Return the nft commands that create and list *table*, which drops TCP to and from *ports* on loopback.
+
+    Its flag ``owner`` removes the table when the process that created it exits.  Ports that are 0 are left
+    out.
+    """
     name = "".join(letter if letter.isalnum() else "_" for letter in table)
     chosen = ", ".join(str(port) for port in ports if port)
     return (
@@ -159,7 +179,11 @@ def nft_commands(table: str, ports: Sequence[int]) -> str:
 
 
 def _wait_until_it_holds(child: subprocess.Popen[str]) -> None:
-    """Read what nft says: the last command lists both rules, or something went wrong."""
+    """Read the output of *child*, nft, until its last command has listed both rules.
+
+    Raises:
+        ConfigurationError: nft reports an error, or exits.
+    """
     assert child.stdout is not None
     rules = 0
     for line in child.stdout:
@@ -175,7 +199,7 @@ def _wait_until_it_holds(child: subprocess.Popen[str]) -> None:
 
 def _children(pid: int) -> list[int]:
     pids: list[int] = []
-    with contextlib.suppress(OSError):  # it may be gone by now
+    with contextlib.suppress(OSError):  # the process may have exited by now
         for path in Path(f"/proc/{pid}/task").glob("*/children"):
             with contextlib.suppress(OSError):
                 pids += map(int, path.read_text(encoding="ascii").split())

@@ -1,9 +1,9 @@
 """A network link in user space: delay, jitter, a rate and cuts between robots and a server, without root.
 
-`EmulatedLink` relays TCP on loopback; `LinkProcess` does so in a process of its own, so that a busy robot
-does not stretch the link.  Bytes keep their order and none is lost.  A cut is silent:
-sockets stay open, and what was sent meanwhile arrives after it heals, when TCP would have sent it again;
-nobody answers a new connection, since its listener is full.
+`EmulatedLink` relays TCP connections on loopback; `LinkProcess` runs one in a process of its own, so that a
+busy robot does not add to the delay.  Bytes keep their order and none is lost.  A cut closes no socket: bytes
+that are sent during a cut arrive after it, at the time at which TCP would have retransmitted them.  New
+connections are not accepted during a cut, because the queue of the listening socket is kept full.
 """
 
 from __future__ import annotations
@@ -33,28 +33,38 @@ __all__ = [
 ]
 
 _LOOPBACK = "127.0.0.1"
+# Shortest delay of a link with jitter, in seconds, unless its nominal delay is shorter.
 _MIN_S = 0.001
+# A direction of a connection reads no more from its source while it holds more than this many undelivered
+# bytes.
 _HELD_BYTES = 1 << 20
+# Length of the queue of connections that wait to be accepted.
 _BACKLOG = 1024
+# Connections that the link opens to itself during a cut: they fill the listener's queue of one, with one to
+# spare.
 _FILLERS = 2
-"""Connections of its own that fill a listener's queue of one, with one to spare."""
-# First time-out of a lost segment, in seconds; each next one is twice as long, as in TCP on Linux.
+# Time until TCP on Linux retransmits a lost segment, in seconds; it doubles with each further retransmission.
 _FIRST_RETRY_S = 0.2
-# First time-out of a lost segment of a handshake, in seconds.
+# Time until TCP on Linux retransmits the first segment of a connection (SYN), in seconds; it doubles, too.
 _FIRST_DIAL_RETRY_S = 1.0
-# Longest time-out, in seconds.
+# Longest time between two retransmissions, in seconds.
 _MAX_RETRY_S = 120.0
+# Longest wait for an answer of the process of a link, in seconds; starting the process is the slowest case.
 _START_TIMEOUT_S = 20.0
+# Timers of asyncio fire up to 1 ms late; they are set this much earlier, in seconds, so that the mean error
+# is 0.
 _TIMER_GRAIN_S = 0.0005
-"""A timer of the loop rings up to a millisecond late; half of that early is right on average."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkProfile:
-    """What a link does to each connection: every robot has a radio of its own.
+    """The delay, jitter, rate and cuts of an emulated link.
 
-    ``up`` is from the robots to the server.  Delays are one way; ``jitter_s`` is the half width of
-    a uniform spread around them; a rate of None has no limit.  ``cut_every_s`` None never cuts.
+    Delays and rates apply to each connection on its own, as if every robot had its own radio; a cut applies
+    to all connections.  ``up`` is from a robot to the server, ``down`` from the server to a robot.  Delays
+    are one way; ``jitter_s`` is the half width of a uniform distribution around them.  A rate of None has no
+    limit.  Cuts begin after random times with the mean ``cut_every_s``, None for never, and last
+    ``cut_for_s`` on average.
     """
 
     name: str
@@ -68,13 +78,13 @@ class LinkProfile:
 
     @property
     def round_trip_s(self) -> float:
-        """The nominal delay there and back."""
+        """The nominal delay from a robot to the server and back, without jitter, in seconds."""
         return self.up_s + self.down_s
 
 
 PROFILES = {
     "none": LinkProfile(name="none", up_s=0.0, down_s=0.0),
-    # RSE-PF paper, Sect. 6.1: Shenzhen to Seoul; round trip less computing.
+    # RSE-PF paper, Sect. 6.1, Shenzhen to Seoul: the mean round trip minus the compute time is near 130 ms.
     "paper": LinkProfile(name="paper", up_s=0.065, down_s=0.065),
     "wifi-bad": LinkProfile(
         name="wifi-bad", up_s=0.015, down_s=0.015, jitter_s=0.025, up_mbit_per_s=5.0, down_mbit_per_s=5.0,
@@ -87,17 +97,20 @@ PROFILES = {
 
 
 def profile_named(name: str) -> LinkProfile:
-    """Return a profile; raises UsageError for a name that is none."""
+    """Return the profile called *name*; raises UsageError if there is none."""
     if name not in PROFILES:
         raise UsageError(f"no link named {name!r}", hint=f"choose one of {', '.join(PROFILES)}")
     return PROFILES[name]
 
 
 def retransmitted_s(sent_s: float, healed_s: float, first_s: float = _FIRST_RETRY_S) -> float:
-    """Return when TCP sends again, for the first time after *healed_s*, what it sent in vain at *sent_s*.
+    """Return the time of the first retransmission at or after *healed_s* of a segment first sent at *sent_s*.
+
+    Retransmissions before *healed_s* are lost.  *first_s* is the time until the first one; all are in
+    seconds.
 
     Source:
-        RFC 6298: the pause doubles with every try; Linux begins with 0.2 s, or 1 s for a SYN.
+        RFC 6298: the time-out doubles with every retransmission; Linux begins with 0.2 s, or 1 s for a SYN.
     """
     pause_s, at_s = first_s, sent_s
     while at_s < healed_s:
@@ -107,7 +120,10 @@ def retransmitted_s(sent_s: float, healed_s: float, first_s: float = _FIRST_RETR
 
 
 class Lane:
-    """One direction of one connection: when do bytes arrive?  Reads no clock and moves no bytes."""
+    """Arrival times of the bytes in one direction of one connection.
+
+    The class computes times only: it reads no clock and moves no bytes.
+    """
 
     def __init__(
         self, *, delay_s: float, jitter_s: float, mbit_per_s: float | None, random: random.Random
@@ -120,7 +136,7 @@ class Lane:
         self._last_s = 0.0
 
     def arrival_s(self, now_s: float, size: int) -> float:
-        """Return when *size* bytes that are sent now arrive: never before what was sent earlier."""
+        """Return the time at which *size* bytes sent at *now_s* arrive, never before earlier bytes."""
         self._sent_s = max(self._sent_s, now_s)
         if self._bytes_per_s is not None:
             self._sent_s += size / self._bytes_per_s
@@ -131,7 +147,10 @@ class Lane:
 
 
 class EmulatedLink:
-    """A relay between a port of its own and a server; use it with ``async with``."""
+    """A TCP relay from a free port of loopback to a server, with the delays of *profile*.
+
+    Use it with ``async with``; ``port`` is the port to connect to.
+    """
 
     def __init__(self, profile: LinkProfile, target_host: str, target_port: int, *, seed: int = 0) -> None:
         self.profile = profile
@@ -148,7 +167,7 @@ class EmulatedLink:
         self._fillers: dict[Any, socket.socket] = {}
 
     async def __aenter__(self) -> EmulatedLink:
-        """Listen on a free port of loopback."""
+        """Listen on a free port of loopback, and begin the cuts of the profile."""
         self.loop = asyncio.get_running_loop()
         self._listener = socket.create_server((_LOOPBACK, 0), backlog=_BACKLOG)
         self._listener.setblocking(False)
@@ -175,7 +194,10 @@ class EmulatedLink:
         await asyncio.sleep(0)
 
     def cut(self, cause: str = "asked") -> None:
-        """Drop everything in both directions, without closing a connection."""
+        """Deliver nothing in either direction from now on, without closing a connection.
+
+        The cut lasts until `heal` was called for each *cause* of it.
+        """
         self._cutting.add(cause)
         if not self.is_cut:
             self.cuts += 1
@@ -183,7 +205,10 @@ class EmulatedLink:
             self._stop_answering()
 
     def heal(self, cause: str = "asked") -> None:
-        """Let through again what was and will be sent, unless another cause still cuts."""
+        """End the cut of *cause*.
+
+        Deliver again, also the bytes sent meanwhile, unless another cause remains.
+        """
         self._cutting.discard(cause)
         if self._cutting or not self.is_cut:
             return
@@ -197,7 +222,7 @@ class EmulatedLink:
         while True:
             try:
                 connection, address = self._listener.accept()
-            except OSError:  # none waits, or the robot is gone already
+            except OSError:  # no connection waits, or the robot has closed its connection already
                 return
             filler = self._fillers.pop(address, None)
             if filler is not None:
@@ -213,7 +238,7 @@ class EmulatedLink:
         await self.loop.connect_accepted_socket(lambda: _RobotEnd(self), connection)
 
     def _stop_answering(self) -> None:
-        """Let Linux drop the SYN of each new connection: the listener's queue is full."""
+        """Let Linux drop the SYN of each new connection, by filling the queue of the listening socket."""
         assert self._listener is not None
         self._accept()
         self.loop.remove_reader(self._listener)
@@ -234,7 +259,7 @@ class EmulatedLink:
         self.loop.add_reader(self._listener, self._accept)
 
     def lanes(self) -> tuple[Lane, Lane]:
-        """Return the two directions of a new connection, up first."""
+        """Return the two directions of a new connection: from the robot to the server, and back."""
         self._accepted += 1
         p, source = self.profile, random.Random(f"{self._seed}/{self._accepted}")
         up = Lane(delay_s=p.up_s, jitter_s=p.jitter_s, mbit_per_s=p.up_mbit_per_s, random=source)
@@ -242,7 +267,10 @@ class EmulatedLink:
         return up, down
 
     def dial(self, make: Callable[[], asyncio.Protocol], failed: Callable[[], None]) -> None:
-        """Open a connection to the server for a robot."""
+        """Open a connection to the server with the protocol of *make*.
+
+        Call *failed* if that is not possible.
+        """
 
         async def work() -> None:
             try:
@@ -255,7 +283,7 @@ class EmulatedLink:
         task.add_done_callback(self._tasks.discard)
 
     def at(self, when_s: float, act: Callable[..., None], *arguments: Any) -> None:
-        """Call *act* with *arguments* at *when_s*, a time of the loop."""
+        """Call *act* with *arguments* at *when_s*, a time of the event loop's clock."""
         self.loop.call_at(when_s - _TIMER_GRAIN_S, act, *arguments)
 
     async def _cut_periodically(self, every_s: float) -> None:
@@ -268,7 +296,10 @@ class EmulatedLink:
 
 
 class _Way:
-    """Bytes on their way from one socket to the other; None stands for the end."""
+    """The bytes on their way in one direction of a connection, from the socket ``source`` to ``sink``.
+
+    An entry of None in the queue stands for the end of the stream.
+    """
 
     def __init__(self, link: EmulatedLink, lane: Lane) -> None:
         self.source: asyncio.Transport | None = None
@@ -282,7 +313,10 @@ class _Way:
         link.ways.add(self)
 
     def send(self, data: bytes | None) -> None:
-        """Take bytes from the source; hold it back when too many are on their way."""
+        """Queue *data* from the source, None for its end.
+
+        Pause the source while more than 1 MiB are queued.
+        """
         now = self._link.loop.time()
         size = len(data) if data is not None else 0
         due = math.inf if self._opens_s is None else self._lane.arrival_s(max(now, self._opens_s), size)
@@ -293,12 +327,12 @@ class _Way:
         self._arm()
 
     def attach(self, sink: asyncio.Transport) -> None:
-        """Tell where the bytes go."""
+        """Set the socket to which the bytes are delivered."""
         self.sink = sink
         self._arm()
 
     def open(self, when_s: float) -> None:
-        """Tell when the handshake is over: only then is anything sent."""
+        """Let bytes be sent from *when_s* on, the end of the emulated TCP handshake."""
         self._opens_s = when_s
         self._queue = deque(
             (self._lane.arrival_s(when_s, len(data or b"")), when_s, data) for _, _, data in self._queue
@@ -306,17 +340,17 @@ class _Way:
         self._arm()
 
     def retry(self, healed_s: float) -> None:
-        """Deliver what fell into the cut, when TCP sends the first of it again."""
+        """After a cut, delay the queued bytes until TCP would have retransmitted the oldest of them."""
         if not self._queue or self._opens_s is None:
             return
         first = retransmitted_s(self._queue[0][1], healed_s)
         again = self._lane.arrival_s(first, 0)
         self._queue = deque((max(due, again), sent, data) for due, sent, data in self._queue)
-        self._armed_s = None  # the timer that was set finds another time here, and does nothing
+        self._armed_s = None  # a timer that was set before compares its time with this one, and does nothing
         self._arm()
 
     def end(self) -> None:
-        """Forget everything and close both sockets."""
+        """Drop the queued bytes and close both sockets at once."""
         self._link.ways.discard(self)
         self._queue.clear()
         for transport in (self.source, self.sink):
@@ -346,12 +380,12 @@ class _Way:
             if not self.sink.is_closing():
                 self.sink.write(data)
         if self._held <= _HELD_BYTES // 2 and self.source is not None and not self.source.is_closing():
-            self.source.resume_reading()  # does nothing unless it was paused
+            self.source.resume_reading()  # has no effect if reading is not paused
         self._arm()
 
 
 class _End(asyncio.Protocol):
-    """One socket: what it sends goes to *out*."""
+    """One of the two sockets of a relayed connection: it feeds ``out`` and gets the bytes of ``back``."""
 
     out: _Way
     back: _Way
@@ -375,7 +409,7 @@ class _ServerEnd(_End):
 
 
 class _RobotEnd(_End):
-    """Accepted from a robot; the server is dialled once the SYN would have arrived there."""
+    """The socket to a robot: the server is connected once the robot's SYN would have arrived there."""
 
     def __init__(self, link: EmulatedLink) -> None:
         self._link = link
@@ -390,7 +424,7 @@ class _RobotEnd(_End):
         link.at(now + link.profile.up_s, self._dial, now)
 
     def _dial(self, accepted_s: float) -> None:
-        """Connect to the server; a SYN that falls into a cut is sent again, too."""
+        """Connect to the server; during a cut, try again when TCP would retransmit the SYN."""
         link = self._link
         if self.out not in link.ways:  # the link is closed
             return
@@ -409,7 +443,7 @@ class _RobotEnd(_End):
 
 
 class LinkProcess:
-    """A `EmulatedLink` in a process of its own; use it with ``async with``."""
+    """An `EmulatedLink` in a process of its own; use it with ``async with``, then connect to ``port``."""
 
     def __init__(self, profile: LinkProfile, target_host: str, target_port: int, *, seed: int = 0) -> None:
         self.port = 0
@@ -418,7 +452,7 @@ class LinkProcess:
         self._pipe: Connection | None = None
 
     async def __aenter__(self) -> LinkProcess:
-        """Start it; raises ConfigurationError if it does not come up."""
+        """Start the process; raises ConfigurationError if it does not report its port within 20 s."""
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_run, args=(self._arguments, theirs), name="link", daemon=True)
@@ -434,15 +468,15 @@ class LinkProcess:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process."""
+        """Close the pipe, on which the process exits; kill it after 2 s."""
         await self._end()
 
     async def cut(self) -> None:
-        """Let nothing through; returns once that is so."""
+        """Begin a cut; return once the process has confirmed it."""
         await self._ask("cut")
 
     async def heal(self) -> None:
-        """Let everything through again; returns once that is so."""
+        """End the cut; return once the process has confirmed it."""
         await self._ask("heal")
 
     async def _ask(self, word: str | None) -> Any:
@@ -470,7 +504,7 @@ def _exchange(pipe: Connection, word: str | None) -> Any:
 
 
 def _run(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None:
-    """Be the process of a link until the parent is gone."""
+    """Run an `EmulatedLink` until the parent closes *pipe* or exits; entry point of the process."""
     try:
         asyncio.run(_serve(arguments, pipe))
     except KeyboardInterrupt:
@@ -482,7 +516,7 @@ async def _serve(arguments: tuple[LinkProfile, str, int, int], pipe: Connection)
     over = asyncio.Event()
     async with EmulatedLink(profile, host, port, seed=seed) as link:
 
-        def hear() -> None:
+        def follow_order() -> None:
             try:
                 word = pipe.recv()
             except (EOFError, OSError):
@@ -494,5 +528,5 @@ async def _serve(arguments: tuple[LinkProfile, str, int, int], pipe: Connection)
             pipe.send(word)
 
         pipe.send(link.port)
-        link.loop.add_reader(pipe.fileno(), hear)
+        link.loop.add_reader(pipe.fileno(), follow_order)
         await over.wait()

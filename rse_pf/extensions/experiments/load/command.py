@@ -34,7 +34,10 @@ __all__ = ["ACTION"]
 
 @dataclass(frozen=True, kw_only=True)
 class SwarmRequest:
-    """The load, and the platform that gets it; None means the value of the scenario."""
+    """Options of ``rse-pf swarm``.
+
+    None for a field of the load means the value of ``--scenario`` or the default.
+    """
 
     settings: Path | None = None
     scenario: Path | None = option(
@@ -76,7 +79,7 @@ class SwarmRequest:
 
 
 def swarm(request: SwarmRequest, settings: PlatformSettings) -> int:
-    """Check the options and run the swarm."""
+    """Check the options, run the load, and return the exit code of `run_swarm`."""
     from rse_pf.extensions.experiments.load.run import run_swarm
     from rse_pf.extensions.experiments.load.scenario import LoadScenario, read_scenario
     from rse_pf.extensions.recording.writer import with_recordings

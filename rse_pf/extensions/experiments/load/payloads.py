@@ -1,4 +1,4 @@
-"""The payloads that both load generators send, encoded once, with their true answers."""
+"""The payloads that both load generators send, each encoded once, with the correct answer to it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ from rse_pf.wire.preencoded import PreencodedCommand, preencode
 
 __all__ = ["SolvedPayload", "is_right", "make_payloads"]
 
+# Number of different payloads that a load repeats: so many that caches of servers do not help.
 _POOL = 64
-"""Different payloads of a load: enough that no cache answers."""
-_POSE_M, _POSE_RAD = 0.05, math.radians(1.0)
-"""A pose with a larger error is wrong; with 200 matches the error is one or two centimetres."""
+# A pose whose camera centre is farther from the truth than this, in metres, is counted as wrong; with 200
+# matches the error is one or two centimetres.
+_POSE_M = 0.05
+# A pose whose rotation differs from the truth by more than this, in radians, is counted as wrong.
+_POSE_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedPayload:
-    """An encoded payload and the true answer: a pose, or the numbers of an echo."""
+    """An encoded payload and its correct answer: the pose of a PnP problem, or the numbers of an echo."""
 
     payload: PreencodedCommand
     T_camera_world: Array | None = None
@@ -34,7 +37,7 @@ class SolvedPayload:
 
 
 def make_payloads(scenario: LoadScenario, session: SessionSettings) -> list[SolvedPayload]:
-    """Return a pool of seeded problems with known answers, encoded for the codec of *scenario*."""
+    """Return 64 seeded payloads for the service of *scenario*, encoded by its codec, with their answers."""
     codec = make_codec(scenario.codec, session)
     if scenario.service == "echo":
         numbers = np.random.default_rng(scenario.seed).integers(0, 1000, (_POOL, max(1, scenario.matches)))
@@ -52,7 +55,10 @@ def make_payloads(scenario: LoadScenario, session: SessionSettings) -> list[Solv
 
 
 def is_right(problem: SolvedPayload, reply: Any) -> bool:
-    """Return whether a reply agrees with the truth: 5 cm and 1 degree for a pose."""
+    """Return whether *reply* is correct: an equal echo, or a pose within 5 cm and 1 degree of the true one.
+
+    A reply that lacks the expected value, or has another shape, is not correct.
+    """
     try:
         if problem.T_camera_world is None:
             return bool(reply["value"] == problem.echo)

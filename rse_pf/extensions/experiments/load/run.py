@@ -1,7 +1,8 @@
 """One run of ``rse-pf swarm``: run the robots for a time, show progress, write the records and a report.
 
-Writes ``commands.csv``, ``events.jsonl``, ``report.json``, and ``scenario.json``, which repeats the run; the
-report is computed from the commands and the figures of the load generator.  The folder holds no key.
+The folder of results gets ``commands.csv``, ``events.jsonl``, ``report.json``, and ``scenario.json``, with
+which the run can be repeated.  The report is computed from the commands and the figures of the load
+generator.  No key is written to the folder.
 """
 
 from __future__ import annotations
@@ -45,15 +46,20 @@ __all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm", "table_of"]
 
 SCENARIO = "scenario.json"
 FAST_MS = 150.0
-"""Limit for "answered in time": below the paper's mean round trip of 156.36 ms."""
+"""A command that is answered within this many ms counts as answered in time.
 
+The paper's mean is 156.36 ms.
+"""
+
+# Longest wait until all robots have joined, beyond their joining times, in seconds.
 _JOIN_S = 30.0
+# Time between two lines of progress, in seconds.
 _SHOW_EVERY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class TargetPlatform:
-    """A platform that runs already: its address, and the function that issues tokens for it."""
+    """A platform that runs already: its address, and a function that returns a token for a robot's name."""
 
     url: str
     token_of: Callable[[str], str]
@@ -67,9 +73,13 @@ def run_swarm(
     platform: TargetPlatform | None = None,
     quiet: bool = False,
 ) -> int:
-    """Run *scenario* on *platform*; None starts one for the run.
+    """Run *scenario* on *platform*, write records and report to *out*, and print the report.
 
-    Returns 0 if every command was answered or failed, once, and all poses were right.
+    If *platform* is None, a local platform is started for the run.  *quiet* prints no progress.
+
+    Returns:
+        1 if a command was lost or answered twice, if a reply was wrong, or if nothing was answered; otherwise
+        0.
     """
     if platform is not None:
         asyncio.run(_check(platform, settings))
@@ -87,9 +97,10 @@ def run_swarm(
 
 
 def report_of(scenario: LoadScenario, result: SwarmResult, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the report of a run.
+    """Return the content of ``report.json``: figures of *result*, *scenario*, and the environment *before*.
 
-    The frame rate of a robot is its answers over the time between its first and last planned command.
+    The frame rate of a robot is the number of its answered commands, divided by the time from its first to
+    its last planned command and one frame interval.
     """
     sent = max(1, len(result.commands))
     return {
@@ -162,13 +173,16 @@ async def _run(
 
 
 async def _check(platform: TargetPlatform, settings: PlatformSettings) -> None:
-    """Connect once: the robots would wait 30 s for a platform that does not answer, and not say why."""
+    """Connect one robot, so that the error of a platform that cannot be reached is raised at once.
+
+    Without this, the robots would retry for 30 s, and the error would not name the cause.
+    """
     async with connect(platform.url, token=platform.token_of("swarm-check"), settings=settings.session):
         pass
 
 
 async def _show(swarm: Swarm, quiet: bool) -> None:
-    """Print one line per second: what was answered since the last line."""
+    """Print each second, until cancelled: connected robots, answers per second and their round trips."""
     seen, last_s = 0, time.monotonic()
     while not quiet:
         await asyncio.sleep(_SHOW_EVERY_S)
@@ -200,7 +214,10 @@ def _frame_rates(commands: list[CommandRecord], fps: float) -> list[float]:
 
 
 def table_of(report: Mapping[str, Any], folder: Path) -> str:
-    """Return the report that is saved in *folder* as the lines that a terminal shows."""
+    """Return the main figures of *report* as the text that a terminal shows.
+
+    *folder* is named as their place.
+    """
     commands, trip, own = report["commands"], report["round_trip_ms"], report["generator"]
     failures = ", ".join(f"{code} {count}" for code, count in report["failures_by_code"].items()) or "none"
     rows = [
@@ -219,7 +236,7 @@ def table_of(report: Mapping[str, Any], folder: Path) -> str:
 
 
 def _held_back(counts: Mapping[str, int]) -> str:
-    """Return how many commands the robots held back, and why."""
+    """Return the text that counts the commands which robots held back, by reason."""
     return f"{counts.get('busy', 0)} after busy, {counts.get('own-limit', 0)} by their own limit"
 
 

@@ -1,8 +1,9 @@
-"""What the robots of a load do, as one value and one file, for both load generators.
+"""The description of a load (how many robots send which commands), as a value and as a JSON file.
 
-`rse_pf.extensions.experiments.load.swarm` drives the robots by the real SDK; the generator in C of
-``benchmarks`` drives more of them, by the same messages at the same rate.  Where they connect is not part of
-it."""
+Two load generators read it: `rse_pf.extensions.experiments.load.swarm` runs robots with the real SDK, and the
+generator in C of ``benchmarks`` sends the same messages at the same rate for more robots.  The address of the
+platform is not part of the description.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +21,27 @@ from rse_pf.wire import CODECS
 __all__ = ["LoadScenario", "read_scenario", "write_scenario"]
 
 SERVICES = ("pnp", "echo")
-"""Services that the robots can call, because their true answers are known."""
+"""Services that the robots of a load can call: their correct answers are known.
 
-_MAX_ROBOTS, _MAX_PROCESSES, _MAX_FPS, _MAX_MATCHES = 10_000, 16, 200.0, 5000
-_MAX_S = 86400.0
+So replies are checked.
+"""
+
+_MAX_ROBOTS = 10_000
+_MAX_PROCESSES = 16
+_MAX_FPS = 200.0  # commands per second of each robot
+_MAX_MATCHES = 5000  # matches of a PnP problem, or numbers of an echo
+_MAX_S = 86400.0  # longest load: a day
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadScenario:
-    """Number of robots and what they do; raises UsageError for a value out of range.
+    """A load: the number of robots and what each of them sends; raises UsageError for a value out of range.
 
-    Robot k connects ``k * join_every_s`` after the start; ``seconds`` count from when all have joined.
-    ``keep`` asks the platform to answer every frame, not only the newest.  ``link`` names a profile of
-    `rse_pf.extensions.experiments.faults.network_emulator`, and ``processes`` counts those of the generator
-    in Python.
+    Robot k connects ``k * join_every_s`` seconds after the start, and sends ``fps`` commands per second.
+    ``seconds`` count from when all robots have joined.  ``matches`` and ``outliers`` (a ratio, 0 to 0.9) are
+    those of each PnP problem.  ``keep`` asks the platform to answer every frame, not only the newest.
+    ``link`` names a profile of `rse_pf.extensions.experiments.faults.network_emulator`; None emulates no
+    network. ``processes`` is the number of processes of the generator in Python.
     """
 
     robots: int = 10
@@ -69,7 +77,9 @@ class LoadScenario:
 
 
 def read_scenario(file: Path) -> LoadScenario:
-    """Read a JSON object whose members are fields of `LoadScenario`; the others have their defaults.
+    """Read a JSON object whose members are fields of `LoadScenario`.
+
+    Fields that it lacks have their defaults.
 
     Raises:
         UsageError: The file cannot be read, holds something else, or a value is out of range.
@@ -91,7 +101,7 @@ def read_scenario(file: Path) -> LoadScenario:
 
 
 def write_scenario(file: Path, scenario: LoadScenario) -> Path:
-    """Write what `read_scenario` reads; return *file*."""
+    """Write *scenario* to *file* as the JSON that `read_scenario` reads; return *file*."""
     file.write_text(json.dumps(asdict(scenario), indent=2) + "\n", encoding="utf-8")
     return file
 

@@ -1,7 +1,7 @@
 """The load generator: `Swarm` runs many robots in child processes and collects their records.
 
-``round_trip_ms`` counts from the time at which a command was *planned*, so that a stall of the platform or of
-the generator is part of it.
+``round_trip_ms`` of a record counts from the time for which the command was *planned*, so that the time in
+which the platform or the generator stalled is included.
 """
 
 from __future__ import annotations
@@ -47,8 +47,11 @@ from rse_pf.wire.rate_limit import REASONS
 
 __all__ = ["Swarm", "SwarmResult", "records_of"]
 
+# Longest wait until all child processes have encoded their payloads, in seconds.
 _READY_TIMEOUT_S = 60.0
+# Longest wait for the answer of a child process to an order, beyond the time that the order itself takes.
 _END_TIMEOUT_S = 30.0
+# The start is planned this far ahead, in seconds, so that every child has received the order before it.
 _HEAD_START_S = 0.2
 
 Event = Mapping[str, Any]
@@ -58,10 +61,12 @@ Event = Mapping[str, Any]
 class SwarmResult:
     """The commands of all robots, and the cost of generating them.
 
-    ``held_back`` counts the commands that were not sent at once, as `client_sdk.Stats` does.  ``cpu_s`` is
-    the CPU time of all processes of the generator during ``wall_s``; ``duplicates`` counts answers that were
-    delivered twice; ``late_sends_ms_p99`` is the delay of the generator itself between the planned and the
-    real send time.
+    ``cpu_s`` is the CPU time of all processes of the generator during ``wall_s`` seconds.  ``reconnects``,
+    ``resent`` and ``moves`` (migrations to another server) are sums over the robots, ``duplicates`` counts
+    answers that arrived twice, and ``held_back`` counts by reason the commands that the SDK did not send at
+    once, as `client_sdk.Stats` does.  ``late_sends_ms_p99`` is the 99th percentile of the delay between the
+    planned and the real send time, which the generator itself causes.  ``link`` names the profile of the
+    emulated network.
     """
 
     commands: list[CommandRecord]
@@ -79,7 +84,7 @@ class SwarmResult:
 
 @dataclass(slots=True, eq=False)
 class _Child:
-    """A process of robots, in its parent."""
+    """What the parent knows about a process that runs the robots with these ``numbers``."""
 
     process: Any
     pipe: Connection
@@ -89,7 +94,7 @@ class _Child:
 
 
 class Swarm:
-    """Robots in child processes; use it with ``async with``, then `start`."""
+    """Robots in child processes: ``async with`` starts the processes, `start` connects the robots."""
 
     def __init__(
         self,
@@ -105,11 +110,13 @@ class Swarm:
 
         Args:
             scenario: Number of robots and what they do.
-            url: Address of the platform; an emulated link leads there.
+            url: Address of the platform; an emulated network, if the scenario has one, is put before it.
             token_of: Returns a token for a robot; called in this process whenever a robot connects.
             session: Limits and timeouts of the robots.
-            on_event: Called with each join, lost link and migration; ``time`` as in the records.
-            origin: The `time.monotonic` that is 0 in all records; None means the start.
+            on_event: Called with an event for each robot that joins, leaves, loses its connection or
+                migrates; its
+                ``time`` is in seconds since *origin*, as in the records.
+            origin: The `time.monotonic` from which all records count; None means the time of `start`.
         """
         self.scenario = scenario
         self.joined: set[str] = set()
@@ -128,10 +135,10 @@ class Swarm:
         self._problem: CommandFailed | None = None
 
     async def __aenter__(self) -> Swarm:
-        """Start the processes and the link; returns when the payloads are encoded.
+        """Start the emulated network and the processes; return when every process has encoded its payloads.
 
         Raises:
-            CommandFailed: A process did not start.
+            CommandFailed: A process failed, or was not ready within 60 s.
         """
         try:
             await self._launch()
@@ -146,11 +153,11 @@ class Swarm:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End every process."""
+        """Stop every child process and the emulated network."""
         await self._end()
 
     async def start(self) -> None:
-        """Let the robots connect: robot k does ``k * join_every_s`` from now."""
+        """Order the robots to connect and send: robot k connects ``k * join_every_s`` seconds from now."""
         self._start_s = time.monotonic() + _HEAD_START_S
         if self._origin_s is None:
             self._origin_s = self._start_s
@@ -158,17 +165,26 @@ class Swarm:
             child.pipe.send(StartSwarm(self._start_s, self._origin_s))
 
     async def wait_joined(self, timeout_s: float) -> None:
-        """Wait until every robot is connected and sends; raises CommandFailed after *timeout_s*."""
+        """Wait until every robot has sent its first command; raises CommandFailed after *timeout_s*."""
         wanted = self.scenario.robots
         await self._until(lambda: len(self.joined) >= wanted, timeout_s, "join")
 
     async def wait_answered(self, count: int, timeout_s: float) -> None:
-        """Wait until *count* more commands have ended; raises CommandFailed after *timeout_s*."""
+        """Wait until *count* more commands were answered or failed.
+
+        Raises CommandFailed after *timeout_s*.
+        """
         wanted = count + sum(map(len, self.rows))
         await self._until(lambda: sum(map(len, self.rows)) >= wanted, timeout_s, f"answer {count} times")
 
     async def leave(self, n: int | None = None) -> None:
-        """Disconnect the *n* robots that joined last, or all; returns when they have disconnected."""
+        """Disconnect the *n* robots that joined last, or all if *n* is None.
+
+        Return when they have disconnected.
+
+        Raises:
+            CommandFailed: They did not disconnect within 30 s after the deadline of their commands.
+        """
         count = len(self._staying) if n is None else min(n, len(self._staying))
         leaving = set(self._staying[len(self._staying) - count :])
         self._staying = [number for number in self._staying if number not in leaving]
@@ -178,7 +194,13 @@ class Swarm:
         await self._until(lambda: names <= self.left, self.scenario.deadline_s + _END_TIMEOUT_S, "leave")
 
     async def finish(self, grace_s: float = 5.0) -> SwarmResult:
-        """Stop sending, wait up to *grace_s* for answers, end the processes; open commands count as lost."""
+        """Stop sending, wait up to *grace_s* seconds for answers, and return the result.
+
+        The child processes exit.  A command without an answer by then counts as lost.
+
+        Raises:
+            CommandFailed: A process failed, or did not report its result in time.
+        """
         for child in self._children:
             child.pipe.send(FinishSwarm(grace_s))
         await self._until(
@@ -285,7 +307,7 @@ class Swarm:
 
 
 def records_of(rows: ResultRows) -> Iterator[CommandRecord]:
-    """Return the records of *rows*; a command without a code was never answered."""
+    """Yield a record for each of *rows*; the code of a command that was never answered is empty."""
     for place, (server, code) in enumerate(zip(rows.servers, rows.codes, strict=True)):
         row: array[float] = rows.numbers[place * ResultRows.WIDTH : (place + 1) * ResultRows.WIDTH]
         number, identity, planned, sent, answered, size, up_ms, queue_ms, compute_ms, down_ms = row

@@ -1,7 +1,8 @@
-"""Many robots in one process: the real SDK, encoded payloads, and send times that are fixed before the run.
+"""Many robots in one process: they use the real SDK, and send encoded payloads at times fixed before the run.
 
-The load is open: a late answer delays no command, and every latency counts from the planned time, so that all
-commands that were planned during a stall include it.  Every pose is compared with the true one.
+The load is open: a late answer delays no later command.  Every latency counts from the planned send time, so
+that the commands which were planned while the platform stalled include the time of the stall.  Every reply is
+compared with the correct one.
 """
 
 from __future__ import annotations
@@ -39,17 +40,22 @@ __all__ = [
     "run_swarm_process",
 ]  # fmt: skip
 
+# The parts of a round trip (up, queue, compute, down) of a command that has none, because it has no result.
 _NO_PARTS = (math.nan,) * 4
+# Rows of commands that are sent to the parent in one message at most.
 _ROWS = 256
+# Rows wait for at most this long before they are sent to the parent, in seconds.
 _FLUSH_EVERY_S = 0.5
-# Pause of a robot whose first connection failed.
+# Pause before a robot whose first connection failed connects again, in seconds.
 _REJOIN_S = 1.0
+# Golden ratio: multiples of it, modulo 1, spread the send times of any number of robots evenly over a frame
+# interval.
 _PHASE = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmSpec:
-    """What one process does: the robots *numbers* of all robots of *scenario*."""
+    """The part of a load that one process generates: the robots with these ``numbers`` of ``scenario``."""
 
     numbers: tuple[int, ...]
     url: str
@@ -59,7 +65,10 @@ class SwarmSpec:
 
 @dataclass(frozen=True, slots=True)
 class StartSwarm:
-    """From the parent: robot k connects at ``start_s + k * join_every_s``; ``origin_s`` is 0 in records."""
+    """Order of the parent: robot k connects at ``start_s + k * join_every_s``.
+
+    Both times are of `time.monotonic`; times in records count from ``origin_s``.
+    """
 
     start_s: float
     origin_s: float
@@ -67,29 +76,31 @@ class StartSwarm:
 
 @dataclass(frozen=True, slots=True)
 class RobotsLeave:
-    """From the parent: these robots stop sending, wait for their answers and disconnect."""
+    """Order of the parent: the robots with these numbers stop sending, wait for answers and disconnect."""
 
     numbers: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class FinishSwarm:
-    """From the parent: all robots stop sending, wait up to ``grace_s`` for answers, and the process ends."""
+    """Order of the parent: all robots wait up to ``grace_s`` s for open answers, and the process exits."""
 
     grace_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class SwarmEvent:
-    """From the process: an event of the run; ``time`` as in the records."""
+    """Message to the parent: an event of a robot, with its ``time`` in seconds since the records' origin."""
 
     event: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmEnded:
-    """From the process: its robots have ended; ``counts`` has the counts of `SwarmResult` by their names, and
-    those of ``held_back`` by the reasons.
+    """Last message of a process to the parent, after its robots have disconnected.
+
+    ``cpu_s`` is the CPU time of the process since the start of the load.  ``counts`` are the sums over its
+    robots of the counts of `SwarmResult`, by their names, and of the commands held back, by the reasons.
     """
 
     cpu_s: float
@@ -98,10 +109,11 @@ class SwarmEnded:
 
 @dataclass(slots=True)
 class ResultRows:
-    """Commands that have ended, as columns, which are small in memory and on the pipe; NaN stands for none.
+    """Commands that were answered, failed or were lost, in a form that is small in memory and on the pipe.
 
-    Columns of ``numbers``, row after row: robot, id, planned, sent, answered, bytes, up, queue, compute
-    and down; seconds from the origin, then milliseconds.
+    ``numbers`` holds `WIDTH` values for each command, one command after the other: robot, id; planned, sent
+    and answered time (s since the origin); payload bytes; up, queue, compute and down time (ms).  NaN stands
+    for a time that is not known.  ``servers`` and ``codes`` have an entry for each command.
     """
 
     numbers: array[float] = field(default_factory=lambda: array("d"))
@@ -115,13 +127,19 @@ class ResultRows:
 
 
 def plan_s(scenario: LoadScenario, number: int, start_s: float, frame: int) -> float:
-    """Return when robot *number* sends *frame*: fixed before the run, spread evenly over the robots."""
+    """Return the time (s, `time.monotonic`) for which command *frame* (from 0) of robot *number* is planned.
+
+    Robots have different phases within the frame interval, so that they do not send at the same moment.
+    """
     phase = (number * _PHASE) % 1.0
     return start_s + number * scenario.join_every_s + (frame + phase) / scenario.fps
 
 
 def run_swarm_process(spec: SwarmSpec, pipe: Connection) -> None:
-    """Run the robots of *spec* until the parent ends them; the entry point of the process."""
+    """Run the robots of *spec* until the parent orders the end or closes *pipe*; entry point of the process.
+
+    An `RsePfError` is sent to the parent as `ChildFailed`.
+    """
     try:
         asyncio.run(_Process(spec, pipe).run())
     except RsePfError as error:
@@ -136,11 +154,11 @@ def _send(pipe: Connection, message: Any) -> None:
     try:
         pipe.send(message)
     except OSError:
-        return  # the parent has ended, and this process ends soon
+        return  # the parent has exited, and this process will exit soon
 
 
 class _Process:
-    """All robots of a process, and the rows of their commands."""
+    """All robots of a process, the rows of their commands, and the messages to and from the parent."""
 
     def __init__(self, spec: SwarmSpec, pipe: Connection) -> None:
         self.spec = spec
@@ -157,7 +175,7 @@ class _Process:
         self._cpu_s = 0.0
 
     async def run(self) -> None:
-        """Encode the payloads, follow the orders of the parent, and report the end."""
+        """Encode the payloads, send `ChildReady`, follow the parent's orders, and send `SwarmEnded`."""
         self.pool = await asyncio.to_thread(make_payloads, self.spec.scenario, self.spec.session)
         gc.collect()
         gc.freeze()
@@ -183,12 +201,15 @@ class _Process:
         _send(self._pipe, message)
 
     def report(self, event: str, **details: Any) -> None:
-        """Report an event, with its time."""
+        """Send the parent an *event* that happens now, with *details*."""
         now_s = round(time.monotonic() - self.origin_s, 4)
         self.send(SwarmEvent({"event": event, "time": now_s, **details}))
 
     async def token(self, robot: str) -> str:
-        """Return a fresh token from the parent."""
+        """Request a new token for *robot* from the parent and return it.
+
+        Concurrent calls share one request.
+        """
         future = self._tokens.get(robot)
         if future is None or future.done():
             future = self._tokens[robot] = asyncio.get_running_loop().create_future()
@@ -196,13 +217,13 @@ class _Process:
         return await future
 
     def spawn(self, work: Any) -> None:
-        """Run *work* until it ends or the process does."""
+        """Run the coroutine *work* as a task, which is cancelled when the process finishes."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     def write(self, row: tuple[float, ...], server: str, code: str) -> None:
-        """Add the row of a command that has ended."""
+        """Add the row of an answered, failed or lost command; send all rows once there are 256."""
         self.rows.numbers.extend(row)
         self.rows.servers.append(server)
         self.rows.codes.append(code)
@@ -271,7 +292,10 @@ class _Robot:
         self._ids = itertools.count(1)
 
     async def join(self, start_s: float) -> None:
-        """Connect at the time of this robot, retry until that works, and begin to send."""
+        """Connect at the planned time of this robot, retry every second until connected, and begin to send.
+
+        Frames that were planned before the robot was connected are skipped.
+        """
         from client_sdk import connect
 
         process, spec, scenario = self._process, self._process.spec, self._process.spec.scenario
@@ -296,7 +320,7 @@ class _Robot:
             self._plan(start_s, missed)
 
     async def stop(self, grace_s: float) -> None:
-        """Stop sending, and wait for the answers to what was sent."""
+        """Stop sending, wait up to *grace_s* seconds for answers, and write open commands as lost."""
         self._stopping = True
         if self._next is not None:
             self._next.cancel()
@@ -310,13 +334,13 @@ class _Robot:
         self._waiting.clear()
 
     async def leave(self) -> None:
-        """Stop, then disconnect."""
+        """Stop sending, wait for open answers until their deadline, disconnect, and report ``robot-left``."""
         await self.stop(self._process.spec.scenario.deadline_s)
         await self.close()
         self._process.report("robot-left", robot=self.name)
 
     async def close(self) -> None:
-        """Disconnect."""
+        """Close the connection, if there is one."""
         if self.client is not None:
             await self.client.close()
 

@@ -1,4 +1,5 @@
-"""Section 6 of the paper, again: elasticity, robustness, latency, mapping.
+"""The experiments of the RSE-PF paper's Section 6: elasticity, robustness, latency and mapping.
 
-Scenarios and what they must show belong here; records and figures are in `results` and `plots`.
+This package has the scenarios and the targets of their figures.  The package `results` has the records and
+the computation of figures, and `plots` the drawings.
 """

@@ -34,13 +34,15 @@ __all__ = ["ACTION", "KINDS"]
 T = TypeVar("T")
 
 KINDS = ("latency", "elasticity", "robustness", "map", "live", "verify")
-_ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3, "live": 3}
+# Default of ``--robots`` for each experiment.
+_DEFAULT_ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3, "live": 3}
+# Largest ``--robots`` of each experiment; robots of map and live run in a process each.
 _MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32, "live": 32}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentRequest(SensorRequest):
-    """An experiment with its options, or the results of one that are verified."""
+    """Options of ``rse-pf experiment``: an experiment to run, or a folder of results to verify."""
 
     kind: str = option(choices=KINDS, help="the experiment, or verify")
     folder: Path | None = option(nargs="?", metavar="DIR", help="verify: results of one or more runs")
@@ -95,7 +97,7 @@ class ExperimentRequest(SensorRequest):
 
 
 def run_experiment(request: ExperimentRequest, settings: PlatformSettings) -> int:
-    """Check the options and run the experiment."""
+    """Check the options and run the experiment or the verification; return the exit code."""
     if request.kind == "verify":
         folder = request.folder if request.folder is not None else request.out
         if folder is None:
@@ -107,7 +109,7 @@ def run_experiment(request: ExperimentRequest, settings: PlatformSettings) -> in
         raise UsageError(
             f"{request.kind} takes no folder", hint=f"name the results with --out {request.folder}"
         )
-    robots = _ROBOTS[request.kind] if request.robots is None else request.robots
+    robots = _DEFAULT_ROBOTS[request.kind] if request.robots is None else request.robots
     request = replace(request, out=request.out or Path(f"out-{request.kind}"), robots=robots)
     _check(request)
     return {
@@ -165,7 +167,11 @@ def _robustness(request: ExperimentRequest, settings: PlatformSettings) -> int:
 
 
 def _faults(only: str | None, known: Collection[str]) -> tuple[str, ...]:
-    """Return the faults that the option ``--only`` names; raises UsageError for one that is none."""
+    """Return the fault names in *only*, the comma-separated value of ``--only``, without duplicates.
+
+    Raises:
+        UsageError: A name is not in *known*.
+    """
     chosen = tuple(dict.fromkeys(word for word in (only or "").split(",") if word))
     for word in chosen:
         if word not in known:
@@ -191,7 +197,7 @@ def _live(request: ExperimentRequest, settings: PlatformSettings) -> int:
 
 
 def _options(kind: type[T], request: ExperimentRequest, **changed: Any) -> T:
-    """Return the options of an experiment: its fields by their names on the command line."""
+    """Return a *kind* whose fields have the values of *request* of the same names, or those of *changed*."""
     known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
     given = {name: value for name, value in vars(request).items() if name in known}
     return kind(**{**given, **changed})
@@ -211,7 +217,10 @@ def _verify(folder: Path) -> int:
 
 
 def _rerun(folder: Path, settings: PlatformSettings) -> int:
-    """Run the short form of each experiment in *folder*; return 1 if a figure was not reached."""
+    """Run the short form of each experiment in *folder*.
+
+    Return 1 if it missed a figure of a report, else 0.
+    """
     from rse_pf.extensions.experiments.paper.verify import read_report, report_folders
     from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures
 
@@ -235,7 +244,7 @@ def _rerun(folder: Path, settings: PlatformSettings) -> int:
 
 
 def _parse_short_form(words: list[str]) -> argparse.Namespace:
-    """Parse the arguments in a report, which may be damaged."""
+    """Parse *words*, the arguments of a short run from a report; raises UsageError if they are damaged."""
     parser = Parser(add_help=False)
     add_action(parser, ACTION)
     try:

@@ -1,7 +1,7 @@
-"""The fault "control-plane": it is killed, and a new one adopts the servers.
+"""The fault "control-plane": the control plane is killed, and a new one adopts the running servers.
 
-The platform is a child process here, ``rse-pf local``, as a user runs it; processes are killed by their
-recorded pids.  Platform and robots have ended when the function returns, also after an error.
+The platform is started as a user starts it, as the child process ``rse-pf local``.  The platform and the
+robots are stopped when `run_control_plane_fault` returns, also after an error.
 """
 
 from __future__ import annotations
@@ -38,11 +38,16 @@ from rse_pf.local.state import PlatformState, read_state, state_folder, stop_pla
 
 __all__ = ["run_control_plane_fault"]
 
+# Name of the local platform.
 _NAME = "experiment"
 _SERVERS = 2
+# Seconds under load before the control plane is killed.
 _LEAD_S = 4.0
+# Seconds under load after the new control plane has started.
 _AFTER_S = 6.0
+# Longest wait until all robots have joined, in seconds.
 _JOIN_S = 60.0
+# Time between two reads of the state file, in seconds.
 _POLL_S = 0.05
 
 
@@ -53,7 +58,14 @@ async def run_control_plane_fault(
     robots: LoadScenario,
     down_s: float,
 ) -> None:
-    """Run a platform, kill its control plane for *down_s* under load, start it again; write the records.
+    """Kill the control plane of a platform under load, start it again after *down_s*, and write the records.
+
+    Args:
+        folder: Folder of the records.
+        settings: Settings of the platform.
+        parameters: Parameters of the run, for its first event.
+        robots: The load.
+        down_s: Seconds without a control plane.
 
     Raises:
         CommandFailed: The platform did not start, or did not start again.
@@ -70,7 +82,7 @@ async def run_control_plane_fault(
 
         record("experiment", **parameters, **policy_parameters(settings, 1.0), origin_s=origin_s)
         with (folder / SAMPLES).open("w", newline="", encoding="utf-8") as samples:
-            SampleLog(samples)  # the head alone: the monitor is killed in this scenario
+            SampleLog(samples)  # writes the header only: the monitor is part of the control plane
         child = _launch(home, settings, folder)
         try:
             before = await _running(state_at, child, None, timeout_s)
@@ -108,7 +120,10 @@ async def run_control_plane_fault(
 
 
 def _launch(home: Path, settings: PlatformSettings, folder: Path) -> subprocess.Popen[bytes]:
-    """Start ``rse-pf local`` with the same settings as every other scenario."""
+    """Start ``rse-pf local`` with *settings*.
+
+    Its state is below *home*, its output in ``control-plane.log``.
+    """
     file = folder / "settings.json"
     if not file.exists():
         file.write_text(json.dumps({"context": {"rse-pf": settings.to_dict()}}), encoding="utf-8")
@@ -127,7 +142,11 @@ def _launch(home: Path, settings: PlatformSettings, folder: Path) -> subprocess.
 async def _running(
     folder: Path, child: subprocess.Popen[bytes], before: PlatformState | None, within_s: float
 ) -> PlatformState:
-    """Return the state of the platform once *child* is its control plane and its listener is open."""
+    """Wait until the state file names *child* as the control plane and has a URL, and return that state.
+
+    Raises:
+        CommandFailed: *child* exited, or this took longer than *within_s* seconds.
+    """
     end = time.monotonic() + within_s
     while time.monotonic() < end:
         if child.poll() is not None:

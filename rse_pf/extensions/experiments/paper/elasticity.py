@@ -1,8 +1,8 @@
 """The elasticity experiment (the paper's Fig. 8): robots join, servers are added, one crashes, robots leave.
 
-The emulated cores of a server are chosen by measurement so that all robots need about five servers at 70 %.
-`--speed` compresses the joining interval and the policy's periods, idle time and warm-up by one factor; frame
-rates, deadlines and health checks stay as they are.
+A server emulates a number of cores that is chosen by a measurement, so that all robots together need about
+five servers at 70 % CPU.  `--speed` divides the joining interval and the policy's periods, idle time and
+warm-up by the same factor; frame rates, deadlines and health checks do not change.
 """
 
 from __future__ import annotations
@@ -55,23 +55,30 @@ __all__ = [
     "slowest_replacement_s",
 ]
 
+# Targets of the short run with which ``verify --rerun`` checks this experiment.
 _SHORT_BARS: Bars = {
     **{f"commands/{name}": (0.0, "<=") for name in ("lost", "twice", "failed")},
     **dict.fromkeys(("scale_outs", "scale_ins", "crashes"), (1.0, ">=")),
     "replaced_in_s": (5.0, "<="),
 }
 FIGURE = "elasticity.png"
-_JOIN_EVERY_S = 20.0  # the paper's Fig. 8
+# Seconds between two robots that join, before ``--speed``: that of the paper's Fig. 8.
+_JOIN_EVERY_S = 20.0
+# Number of servers that all robots together should need; the emulated cores of a server are computed from it.
 _SERVERS_AT_FULL = 5
+# Seconds for which the CPU time of a server under load is measured.
 _CALIBRATION_S = 4.0
+# Seconds for which the CPU time of a server without commands is measured.
 _CALIBRATION_IDLE_S = 2.0
+# Largest number of robots in that measurement: one server must be able to serve them all.
 _CALIBRATION_ROBOTS = 20
+# Shortest time without a change of the servers before the next phase begins, in seconds.
 _MIN_QUIET_S = 6.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ElasticityOptions:
-    """Options of the command line; ``emulated_cores`` None means that they are measured first."""
+    """Options of the experiment; ``emulated_cores`` None means that the number is chosen by a measurement."""
 
     out: Path
     robots: int = 100
@@ -86,7 +93,10 @@ class ElasticityOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CpuCost:
-    """CPU seconds of a server: for one command, and for a second without commands."""
+    """CPU seconds that a server uses for one command, and for a second without commands.
+
+    ``commands`` is the number of commands over which the first value was measured.
+    """
 
     command_s: float
     idle_s_per_s: float
@@ -99,7 +109,10 @@ class CpuCost:
 
 
 def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> int:
-    """Run the experiment, write records, report and figure; return 1 if a command was lost or duplicated."""
+    """Run the experiment, write records, report and figure to ``options.out``, and print the report.
+
+    Return 1 if a command was lost or answered twice, else 0.
+    """
     require_matplotlib()
     folder = fresh_folder(
         options.out, [*RUN_FILES, FIGURE, "with-rebalancing", "without-rebalancing", "calibration"]
@@ -143,7 +156,7 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
 
 
 def _runs(options: ElasticityOptions, folder: Path) -> dict[str, tuple[Path, bool]]:
-    """Return folder and rebalancing of each run, by its name in the report."""
+    """Return the folder of each run and whether it rebalances robots, by the run's name in the report."""
     if not options.compare:
         return {"": (folder, options.rebalance)}
     return {
@@ -155,7 +168,10 @@ def _runs(options: ElasticityOptions, folder: Path) -> dict[str, tuple[Path, boo
 async def emulated_cores(
     options: ElasticityOptions, settings: PlatformSettings, folder: Path
 ) -> tuple[float, CpuCost | None]:
-    """Return the cores of a server with which all robots need five, and the cost that was measured for it."""
+    """Return the cores that a server emulates, so that all robots need five servers, and the measured cost.
+
+    The cost is None if the options state the number of cores.
+    """
     if options.emulated_cores is not None:
         return options.emulated_cores, None
     scratch = folder / "calibration"
@@ -173,7 +189,11 @@ async def emulated_cores(
 
 
 async def _measure(options: ElasticityOptions, settings: PlatformSettings, folder: Path) -> CpuCost:
-    """Return what a command costs one server at full speed, under the load of the robots."""
+    """Measure the CPU time of a command on one server without emulated cores, under the load of the robots.
+
+    Raises:
+        CommandFailed: Fewer than ten commands were answered.
+    """
     chosen = settings.replace(serving={"emulated_cores": 0.0})
     robots = min(options.robots, _CALIBRATION_ROBOTS)
     parameters = {"kind": "calibration", "robots": robots, "fps": options.fps}
@@ -206,7 +226,7 @@ async def _measure(options: ElasticityOptions, settings: PlatformSettings, folde
 
 
 async def _run(options: ElasticityOptions, settings: PlatformSettings, folder: Path, rebalance: bool) -> None:
-    """Run the experiment once: joining, full load, crash, leaving, idle."""
+    """Run the phases of the experiment once: joining, full load, crash, leaving, idle."""
     scaling, speed = settings.scaling, options.speed
     period_s, join_every_s = scaling.period_s / speed, _JOIN_EVERY_S / speed
     parameters = {
@@ -263,13 +283,14 @@ def _phase(harness: Harness, name: str) -> None:
     show(f"{harness.now():7.1f} s  {name:<8}  {healthy} healthy servers")
 
 
+# Begin of the scaling policy's reason when it adds servers because some are missing, not because of load.
 _FEWER = "fewer than"
-"""The reason of the policy begins so when servers are missing, not when they are busy."""
+# Samples in the records are rounded: a mean CPU this much below the limit, in percent, counts as reaching it.
 _ROUNDING_PERCENT = 0.01
 
 
 def elasticity_figures(records: Records) -> dict[str, Any]:
-    """Return the figures of an elasticity run.
+    """Return the figures of ``report.json`` for an elasticity run, computed from its records.
 
     Raises:
         UsageError: The events do not hold the parameters of the run.
@@ -318,7 +339,10 @@ def elasticity_figures(records: Records) -> dict[str, Any]:
 
 
 def elasticity_page(report: Mapping[str, Any], runs: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return ``report.md``, with a column for each of *runs*."""
+    """Return the text of ``report.md`` for *report*.
+
+    *runs* holds the figures of each run by its name; a run is a column of the table.
+    """
     asked, cost = report["asked"], report.get("cost")
     cells: dict[str, Callable[[Mapping[str, Any]], Any]] = {
         "scale-outs / scale-ins": lambda run: slashed(run, "scale_outs", "scale_ins"),
@@ -357,7 +381,12 @@ def _phase_round_trip(phase: str, run: Mapping[str, Any]) -> str:
 
 
 def crashes(events: Sequence[Event]) -> list[dict[str, Any]]:
-    """Return every server that ended without a drain, and the time until a new one replaced it."""
+    """Return a row for each server that exited without a drain.
+
+    ``time`` is that of the fault that killed it (s since the start of the run), ``by`` the first healthy
+    server that was launched after that, and ``replaced_in_s`` the time until then; both are None if there was
+    none.
+    """
     leaving = {event["server"] for event in events if event["action"] == "drain-start"}
     launched = {event["server"]: event["time"] for event in events if event["action"] == "server-launched"}
     taken: set[str] = set()
@@ -389,7 +418,10 @@ def crashes(events: Sequence[Event]) -> list[dict[str, Any]]:
 
 
 def slowest_replacement_s(replacements: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the longest replacement time of `crashes`; None if there is none or one was never replaced."""
+    """Return the longest ``replaced_in_s`` of the rows of `crashes`.
+
+    None if there are no rows, or if a server was never replaced.
+    """
     times = [crash["replaced_in_s"] for crash in replacements]
     return max(times) if times and None not in times else None
 
@@ -397,10 +429,11 @@ def slowest_replacement_s(replacements: Sequence[Mapping[str, Any]]) -> float | 
 def busy_periods_before(
     samples: Sequence[MonitorSample], time_s: float, *, origin_s: float, period_s: float, periods: int
 ) -> list[float | None]:
-    """Return the mean CPU of the last whole *periods* before *time_s*, oldest first; None without a sample.
+    """Return the mean CPU (percent) of each of the last whole *periods* before *time_s*, oldest first.
 
-    Periods begin at multiples of *period_s* of the monitor's clock, which was *origin_s* at the start of the
-    run; a sample covers the time since the one before it.
+    A period without a sample has None.  Periods begin at multiples of *period_s* of the monitor's clock,
+    which was *origin_s* at the start of the run.  A sample stands for the time since the previous sample, and
+    belongs to the period in which the middle of that time lies.
     """
     sums: dict[int, list[float]] = {}
     before = None
@@ -420,7 +453,10 @@ def busy_periods_before(
 
 
 def find_unjustified_scale_outs(records: Records) -> list[str]:
-    """Return a line for each scale-out for load that the samples before it do not justify."""
+    """Return a line for each scale-out for high CPU before which the CPU was not high for long enough.
+
+    Required is a mean CPU of at least the policy's limit in each of the ``busy_periods`` periods before it.
+    """
     parameters = parameters_of(records)
     wrong = []
     for event in _scale_outs(records.events):
@@ -441,7 +477,7 @@ def find_unjustified_scale_outs(records: Records) -> list[str]:
 
 
 def _scale_outs(events: Sequence[Event]) -> list[Event]:
-    """Return the scale-outs for load, not those that replace missing servers."""
+    """Return the events of scale-outs, but for those that replace missing servers."""
     return [
         event
         for event in events
@@ -450,7 +486,7 @@ def _scale_outs(events: Sequence[Event]) -> list[Event]:
 
 
 def _fault_before(events: Sequence[Event], gone: Event) -> float:
-    """Return the time of the fault that ended this server; without one, the time of its end."""
+    """Return the time of the last injected fault of *gone*'s server, or the time of *gone* without one."""
     times = [
         float(event["time"])
         for event in events
@@ -462,7 +498,10 @@ def _fault_before(events: Sequence[Event], gone: Event) -> float:
 
 
 def _phases(records: Records) -> dict[str, Any]:
-    """Return the counts, failures and round trips of each phase, by the planned time of the commands."""
+    """Return the counts, failures and round trips of each phase, by its name.
+
+    A command belongs to the phase that holds its planned send time.
+    """
     marks = [event for event in records.events if event["action"] == "phase"]
     figures = {}
     ends = [*(float(mark["time"]) for mark in marks[1:]), math.inf]

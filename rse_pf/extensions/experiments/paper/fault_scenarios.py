@@ -1,8 +1,9 @@
 """The faults that `rse-pf experiment robustness` injects while robots send commands.
 
-A scenario injects its fault, records it with the pid or name of the target, and waits until its consequences
-are over or a timeout has passed.  The figures are computed in
-`rse_pf.extensions.experiments.paper.robustness`."""
+A scenario injects its fault, records an event with the pid or name of the target, and waits until the
+platform has recovered or a timeout has passed.  `rse_pf.extensions.experiments.paper.robustness` computes the
+figures.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +19,25 @@ from rse_pf.extensions.experiments.paper.harness import Harness
 
 __all__ = ["SCENARIOS", "Scenario"]
 
+# Longest wait for the recovery of the platform, in seconds.
 _TIMEOUT_S = 30.0
+# Seconds for which commands are still recorded after a fault and its recovery.
 _AFTER_S = 6.0
+# Pause between two random faults, in seconds.
 _RANDOM_EVERY_S = 3.0
+# Time between two requests for the status of the servers during a link cut, in seconds.
 _POLL_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """One fault, with the number of servers and the link that it needs.
+    """One fault, with the number of servers that it needs, and whether it needs an emulated network link.
 
-    ``inject(harness, seconds, seed)`` gets the duration of the fault and the seed of random choices; None
-    means that the platform itself is a child process, see
-    `rse_pf.extensions.experiments.paper.control_plane_fault`."""
+    ``inject(harness, seconds, seed)`` injects the fault; it gets the duration of the fault (``seconds``
+    divided by ``--speed``) and the seed of random choices.  None stands for the fault of the control plane,
+    whose platform is a child process, see `rse_pf.extensions.experiments.paper.control_plane_fault`.  A
+    ``slow`` fault runs only if ``--only`` names it.
+    """
 
     inject: Callable[[Harness, float, int], Awaitable[None]] | None = None
     seconds: float = 0.0
@@ -95,7 +102,7 @@ async def _wifi(harness: Harness, seconds: float, seed: int) -> None:
 
 
 async def _log_when_empty(harness: Harness) -> None:
-    """Record when no server has a robot any more, more precisely than the samples of the monitor."""
+    """Record the event ``servers-empty`` once no server has a connected robot; checked every 0.1 s."""
     while True:
         servers = await harness.platform.status()
         if len(servers) == len(harness.platform.servers) and not any(server["robots"] for server in servers):
@@ -105,7 +112,10 @@ async def _log_when_empty(harness: Harness) -> None:
 
 
 async def _random(harness: Harness, seconds: float, seed: int) -> None:
-    """Inject faults drawn from *seed*, one after the other; each waits until two servers are healthy."""
+    """Inject faults drawn with *seed* for *seconds*, each once at least two servers are healthy.
+
+    Memory and file descriptors of the servers are recorded before and after.
+    """
     choice, end = random.Random(seed), harness.now() + seconds
     _resources(harness, "before")
     while harness.now() < end:
@@ -165,7 +175,7 @@ async def _wait_replaced(harness: Harness, began: float) -> None:
 
 
 def _resources(harness: Harness, when: str) -> None:
-    """Record resident memory and open file descriptors of supervisors and workers of all servers."""
+    """Record the event ``resources``: resident memory and open file descriptors of all servers' processes."""
     pids = [server.pid for server in harness.platform.servers]
     pids += [worker for server in harness.platform.servers for worker in server.workers]
     page = os.sysconf("SC_PAGE_SIZE")
@@ -174,7 +184,7 @@ def _resources(harness: Harness, when: str) -> None:
         try:
             resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page
             opened = len(os.listdir(f"/proc/{pid}/fd"))
-        except OSError:  # the process has ended meanwhile
+        except OSError:  # the process has exited meanwhile
             continue
         memory, descriptors, processes = memory + resident, descriptors + opened, processes + 1
     harness.log(
@@ -193,4 +203,4 @@ SCENARIOS: dict[str, Scenario] = {
     "scale-out": Scenario(inject=_scale_out),
     "random": Scenario(inject=_random, seconds=600.0, servers=3, slow=True),
 }
-"""Every fault by its name on the command line."""
+"""Every fault of the robustness experiment by its name in ``--only``."""

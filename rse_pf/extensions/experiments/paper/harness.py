@@ -1,7 +1,7 @@
-"""The harness of an experiment: a local platform, its robots, and every record of them while they run.
+"""The harness of an experiment: a local platform, its robots, and the files with the records of the run.
 
-`Harness` opens the record files before anything starts, so that a killed run leaves its events.  When it
-ends, nothing that it started is running, and no key is left in the folder of results.
+`Harness` opens the record files before it starts a process, so that a killed run leaves its events.  At the
+end it stops every process that it started, and deletes the keys from the folder of results.
 """
 
 from __future__ import annotations
@@ -40,13 +40,14 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]
 
+# Events after which `Harness.wait_quiet` waits again.
 _SERVER_CHANGES = {
     "grow", "shrink", "replace", "server-launched", "server-healthy", "server-gone", "phase",
 }  # fmt: skip
 
 
 class Harness:
-    """A platform whose events and samples are recorded; ``async with`` starts and ends it."""
+    """A platform whose events and samples are recorded; ``async with`` starts and stops the platform."""
 
     def __init__(
         self,
@@ -65,9 +66,9 @@ class Harness:
             folder: Folder of the records; it exists and is empty.
             settings: Settings of the platform.
             parameters: Parameters of this run, for its first event.
-            elastic: Whether monitor and scale modifier act.
-            compress: Factor by which their periods are shortened.
-            rebalance: Whether robots migrate from crowded servers.
+            elastic: Whether the monitor and the scale modifier run, which add and remove servers.
+            compress: Factor by which the periods of the scaling policy are divided.
+            rebalance: Whether robots migrate from servers with many robots to others.
             servers: Number of servers at the start; None means that of the settings.
         """
         self.folder = folder
@@ -88,7 +89,7 @@ class Harness:
         self.platform: LocalPlatform
 
     async def __aenter__(self) -> Harness:
-        """Open the records and start the platform; raises what LocalPlatform raises."""
+        """Open the record files and start the platform; an error of LocalPlatform is raised."""
         self.origin_s = time.monotonic()
         events, samples = (
             self._stack.enter_context((self.folder / name).open("w", newline="", encoding="utf-8"))
@@ -116,7 +117,7 @@ class Harness:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the platform, close the records, delete the keys."""
+        """Stop the platform, close the record files and delete the platform's keys."""
         await self._stack.aclose()
         remove_keys(self.folder / "platform")
 
@@ -125,11 +126,14 @@ class Harness:
         return time.monotonic() - self.origin_s
 
     def log(self, action: str, **details: Any) -> None:
-        """Record an event that happens now."""
+        """Record the event *action* with *details* and the present time."""
         self._record(self.now(), action, details)
 
     def swarm(self, options: LoadScenario) -> Swarm:
-        """Return the robots of this run; start them with ``async with``."""
+        """Return the robots of this run, not yet started.
+
+        ``async with`` starts them, and their events are recorded.
+        """
         return Swarm(
             options,
             url=self.platform.url,
@@ -142,7 +146,10 @@ class Harness:
         )
 
     async def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until *condition* holds, evaluated after each event and sample; return whether it did."""
+        """Wait until *condition* returns True; return False if it did not within *timeout_s*.
+
+        It is called after each event and sample, and at least once a second.
+        """
         end = time.monotonic() + timeout_s
         while not condition():
             left = end - time.monotonic()
@@ -156,11 +163,14 @@ class Harness:
         return True
 
     async def run_for(self, seconds: float) -> None:
-        """Let the run go on for *seconds*."""
+        """Wait *seconds* while the run continues and events and samples are recorded."""
         await self.wait_for(lambda: False, seconds)
 
     async def wait_quiet(self, quiet_s: float, timeout_s: float) -> bool:
-        """Wait until the number of servers was not changed for *quiet_s*; return whether that happened."""
+        """Wait until no server was added, removed or replaced for *quiet_s*.
+
+        Return False after *timeout_s*.
+        """
 
         def quiet() -> bool:
             times = (event["time"] for event in self.events if event["action"] in _SERVER_CHANGES)
@@ -169,11 +179,15 @@ class Harness:
         return await self.wait_for(quiet, timeout_s)
 
     def events_since(self, action: str, since_s: float) -> list[dict[str, Any]]:
-        """Return the events *action* since *since_s*."""
+        """Return the recorded events named *action* at or after *since_s* (s since the start of the run)."""
         return [event for event in self.events if event["action"] == action and event["time"] >= since_s]
 
     def busiest(self) -> Any:
-        """Return the server with the most robots, an entry of `LocalPlatform.servers`."""
+        """Return the server with the most robots in the last sample, an entry of `LocalPlatform.servers`.
+
+        Raises:
+            CommandFailed: No server is running.
+        """
         robots = {row.name: row.robots for row in self.samples[-1].servers} if self.samples else {}
         servers = self.platform.servers
         if not servers:
@@ -181,14 +195,17 @@ class Harness:
         return max(servers, key=lambda server: (robots.get(server.name, 0), server.name))
 
     def kill(self, watch_s: float) -> str:
-        """Send SIGKILL to the busiest server and record the fault; return its name."""
+        """Send SIGKILL to the server with the most robots, record the fault, and return the server's name.
+
+        *watch_s* is the time after the fault in which outages are counted for it.
+        """
         victim = self.busiest()
         self.log("fault", fault="kill -9", server=victim.name, pid=victim.pid, watch_s=watch_s)
         os.kill(victim.pid, signal.SIGKILL)
         return str(victim.name)
 
     async def save_result(self, result: SwarmResult) -> None:
-        """Write the commands of the robots and the figures of the load generator."""
+        """Write ``commands.csv`` and the event ``generator`` with the figures of the load generator."""
         await asyncio.to_thread(write_commands, self.folder / COMMANDS, result.commands)
         self.log("generator", **generator_event(result))
 
@@ -205,7 +222,7 @@ class Harness:
 
 
 def generator_event(result: SwarmResult) -> dict[str, Any]:
-    """Return the figures of the load generator, for the event ``generator``."""
+    """Return the figures of the load generator in *result* as the details of the event ``generator``."""
     same = ("cpu_s", "wall_s", "wrong_poses", "reconnects", "resent", "moves")
     return {
         **{name: getattr(result, name) for name in same},
@@ -215,7 +232,7 @@ def generator_event(result: SwarmResult) -> dict[str, Any]:
 
 
 def generator_of(records: Records) -> dict[str, Any]:
-    """Return the figures of the load generator of a run; raises UsageError if the run did not end."""
+    """Return the details of the event ``generator`` of a run; raises UsageError if the run did not finish."""
     for event in records.events:
         if event["action"] == "generator":
             return event_details(event)
@@ -223,7 +240,7 @@ def generator_of(records: Records) -> dict[str, Any]:
 
 
 def policy_parameters(settings: PlatformSettings, compress: float) -> dict[str, Any]:
-    """Return the parameters of the scaling policy, with its periods after compression."""
+    """Return the parameters of the scaling policy for the records, with its times divided by *compress*."""
     scaling, cadence = settings.scaling, cadence_of(settings.scaling)
     return {
         "min_servers": scaling.min_servers,

@@ -1,7 +1,7 @@
-"""The latency experiment: the paper's Sect. 6.2 with a hundred robots behind an emulated long link.
+"""The latency experiment: the paper's Sect. 6.2 with a hundred robots behind an emulated long-distance link.
 
-The link profile ``paper`` delays real packets on the loopback interface.  The report names the profile and
-the lateness of the load generator itself.
+The link profile ``paper`` delays the bytes of real connections on the loopback interface.  The report names
+the profile, and the delay that the load generator itself added.
 """
 
 from __future__ import annotations
@@ -41,13 +41,18 @@ from rse_pf.terminal import show, show_page
 __all__ = ["LatencyOptions", "latency_figures", "latency_page", "run_latency"]
 
 FIGURE = "latency.png"
+# Arguments of the short run with which ``verify --rerun`` checks this experiment.
 _SHORT = ("--robots", "20", "--seconds", "5")
+# Longest wait until all robots have joined, in seconds.
 _JOIN_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LatencyOptions:
-    """Options of the command line; *link* None means no emulated link."""
+    """Options of the experiment.
+
+    ``link`` names a profile of the network emulator, None means no emulated link.
+    """
 
     out: Path
     robots: int = 100
@@ -59,7 +64,10 @@ class LatencyOptions:
 
 
 def run_latency(options: LatencyOptions, settings: PlatformSettings) -> int:
-    """Run the experiment, write records, report and figure; return 1 if a command was lost or duplicated."""
+    """Run the experiment, write records, report and figure to ``options.out``, and print the report.
+
+    Return 1 if a command was lost or answered twice, else 0.
+    """
     require_matplotlib()
     folder = fresh_folder(options.out, [*RUN_FILES, FIGURE])
     load_before = load_average()
@@ -84,7 +92,7 @@ def run_latency(options: LatencyOptions, settings: PlatformSettings) -> int:
 
 
 def _bars(figures: Mapping[str, Any]) -> Bars:
-    """Return what a short run must reach."""
+    """Return the targets of a short run: no lost, duplicated or failed command, and the round trips."""
     return {
         **{f"commands/{name}": (0.0, "<=") for name in ("lost", "twice", "failed")},
         "round_trip_ms/p50": (figures["round_trip_ms"]["p50"], "<="),
@@ -116,7 +124,7 @@ async def _run(options: LatencyOptions, settings: PlatformSettings, folder: Path
 
 
 def latency_figures(records: Records) -> dict[str, Any]:
-    """Return round trip, its parts and the frame rate.
+    """Return the figures of a latency run: counts, round trips and their parts, and frame rates.
 
     Raises:
         UsageError: The events do not hold the parameters of the run.
@@ -143,7 +151,7 @@ def latency_figures(records: Records) -> dict[str, Any]:
 
 
 def latency_page(report: Mapping[str, Any]) -> str:
-    """Return ``report.md``."""
+    """Return the text of ``report.md`` for *report*."""
     paper, trip, link = report["paper"], report["round_trip_ms"], report["asked"]["link"]
     transmission = paper["round_trip_ms"] - paper["compute_ms"]
     rows = [
@@ -178,7 +186,10 @@ def _difference(value: float | None, other: float | None) -> float | None:
 
 
 def _frame_rates(commands: Sequence[CommandRecord]) -> dict[str, float | None]:
-    """Return mean and minimum over the robots of answers per second, while they sent."""
+    """Return the mean and the least number of answers per second of a robot while it sent commands.
+
+    Both are None if no robot sent two commands.
+    """
     by_robot: dict[str, list[CommandRecord]] = defaultdict(list)
     for command in commands:
         by_robot[command.robot].append(command)

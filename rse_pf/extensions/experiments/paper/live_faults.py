@@ -1,7 +1,8 @@
-"""The faults of live maps, each on a platform of its own: what robots notice, and what the map keeps.
+"""The experiment on faults of live maps, each fault on a platform of its own.
 
-A run is the demo with --live and one fault at a moment that its seed draws.  The whole log of the map stays
-in the folder of the run, so that ``verify`` replays it and computes every figure again.
+A run is the demo with --live and one fault at a moment drawn from a seed.  Its figures say how long the
+robots were affected, and whether the map lost a keyframe.  The complete log of the map stays in the folder of
+the run, so that ``verify`` can replay the log and compute every figure again.
 """
 
 from __future__ import annotations
@@ -29,13 +30,17 @@ from rse_pf.terminal import show
 
 __all__ = ["LIVE_FAULTS", "live_faults_page", "run_live_fault", "run_live_faults"]
 
+# Name of the image in the folder of each run.
 _FIGURE = "live.png"
 
 
 def run_live_faults(
     options: DemoOptions, settings: PlatformSettings, faults: Sequence[str], repeat: int = 1
 ) -> int:
-    """Run each of *faults* *repeat* times; return 1 if an acknowledged keyframe or a frame was lost."""
+    """Run each of *faults* *repeat* times, write the report, and print a row for each run.
+
+    Return 1 if an acknowledged keyframe was lost or stored twice, or if a frame got no pose; else 0.
+    """
     require_matplotlib()
     folder = fresh_folder(
         options.out, [*RUN_FILES, *LIVE_FAULTS, *(f"{name}-[1-9]*" for name in LIVE_FAULTS)]
@@ -43,10 +48,12 @@ def run_live_faults(
     load_before = load_average()
     runs: dict[str, dict[str, Any]] = {}
     for fault in faults:
-        for turn in range(repeat):
-            name = fault if repeat == 1 else f"{fault}-{turn + 1}"
+        for repetition in range(repeat):
+            name = fault if repeat == 1 else f"{fault}-{repetition + 1}"
             runs[name] = run_live_fault(
-                replace(options, out=folder / name), settings, LiveFault(name=fault, seed=options.seed + turn)
+                replace(options, out=folder / name),
+                settings,
+                LiveFault(name=fault, seed=options.seed + repetition),
             )
             show(*_lines(runs))
     report = {
@@ -69,7 +76,7 @@ def run_live_faults(
 
 
 def run_live_fault(options: DemoOptions, settings: PlatformSettings, fault: LiveFault) -> dict[str, Any]:
-    """Run the demo with one fault, keep its records in ``options.out``, draw it, and return its figures."""
+    """Run the demo with one fault, write records and image to ``options.out``, and return the figures."""
     run_demo(options, settings, fault)
     folder = options.out.resolve()
     frames = frames_of(options)
@@ -83,7 +90,7 @@ def run_live_fault(options: DemoOptions, settings: PlatformSettings, fault: Live
 
 
 def live_faults_page(report: Mapping[str, Any]) -> str:
-    """Return ``report.md``: a row for each run, each target with whether it was met, and the figures."""
+    """Return the text of ``report.md``: rows of all runs, the targets and whether they were met, images."""
     runs: Mapping[str, Mapping[str, Any]] = report["runs"]
     head, *rows = fault_rows(runs)
     bars = [
@@ -103,7 +110,7 @@ def live_faults_page(report: Mapping[str, Any]) -> str:
 
 
 def _lines(runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the newest row of the table, below its head if it is the first."""
+    """Return the table row of the newest run; for the first run, preceded by the head of the table."""
     head, *rows = fault_rows(runs)
     lines = table(head, [rows[-1]])
     return lines if len(rows) == 1 else lines[2:]

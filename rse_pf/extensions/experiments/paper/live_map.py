@@ -1,7 +1,8 @@
-"""The experiment on live maps: robots that drive now correct each other now, with every figure recomputable.
+"""The experiment on live maps: robots build one map together while they drive.
 
-It runs the demo with --live (real servers, a real load balancer, a process per robot); beside the usual
-records it keeps each robot's poses as given out, its corrections and keyframes, and the published map.
+It runs the demo with --live (real servers, a real load balancer, a process per robot).  In addition to the
+records of every experiment it stores the poses that each robot reported while it drove, its corrections and
+keyframes, and the published map, so that every figure can be computed again.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ FIGURE = "live.png"
 
 
 def run_live(options: DemoOptions, settings: PlatformSettings) -> int:
-    """Run the demo, compute the figures from its files, draw them; return the exit code."""
+    """Run the demo, compute the figures from its files, write report and image.
+
+    Return the demo's exit code.
+    """
     require_matplotlib()
     load_before = load_average()
     code = run_demo(options, settings)
@@ -55,7 +59,7 @@ def run_live(options: DemoOptions, settings: PlatformSettings) -> int:
 
 
 def live_experiment_figures(records: Records) -> dict[str, Any]:
-    """Return the figures of the commands, and ``live``.
+    """Return the figures of a run: those of its commands, and those of the live map as ``live``.
 
     Raises:
         UsageError: The events do not hold the parameters of the run, or a record cannot be read.
@@ -70,7 +74,7 @@ def live_experiment_figures(records: Records) -> dict[str, Any]:
 
 
 def live_page(report: Mapping[str, Any]) -> str:
-    """Return ``report.md``."""
+    """Return the text of ``report.md`` for *report*."""
     return page(
         "# RSE-PF experiment: live map",
         live_table(report["live"]),

@@ -1,7 +1,7 @@
 """The mapping experiment (the paper's Fig. 7): robots build point clouds, and their errors are measured.
 
-It runs the demo (real servers, a real load balancer, a process per robot) and writes the true trajectories
-beside the estimated ones, so that the errors can be computed again.
+It runs the demo (real servers, a real load balancer, a process per robot) and writes the true trajectories to
+the same folders as the estimated ones, so that the errors can be computed again.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ from rse_pf.terminal import show_page
 __all__ = ["CLOUD", "complete_records", "frames_of", "map_figures", "map_page", "run_map"]
 
 CLOUD = "map.ply"
-"""The cloud of one robot, which is long and may not be kept."""
+"""Name of the file with a robot's point cloud; the file is large, and shipped results may lack it."""
+# Frames per robot of the short run with which ``verify --rerun`` checks this experiment.
 _SHORT_FRAMES = 40
 
 
 def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
-    """Run the demo, compute the figures from its files, write the report; return the exit code."""
+    """Run the demo, compute the figures from its files, write the report; return the demo's exit code."""
     load_before = load_average()
     code = run_demo(options, settings)
     folder = options.out.resolve()
@@ -68,13 +69,17 @@ def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
 
 
 def _bars(figures: Mapping[str, Any]) -> Bars:
-    """Return what a short run must reach: no frame fewer, and the error of the worst robot."""
+    """Return the targets of a short run.
+
+    They are no lost or duplicated command, and the largest number of lost frames and the largest ATE in
+    *figures*.
+    """
     bars = {f"commands/{name}": (0.0, "<=") for name in ("lost", "twice")}
     return {**bars, **{name: (max(figures[name]), "<=") for name in ("lost_frames", "ate_cm")}}
 
 
 def _write_truth(options: DemoOptions, folder: Path) -> dict[str, int]:
-    """Write the true trajectory of each robot, if it is known; return the number of frames of each."""
+    """Write ``truth.txt`` of each robot whose true trajectory is known; return the frames of each robot."""
     frames = {}
     for row in range(options.robots):
         name = f"robot-{row + 1}"
@@ -95,7 +100,7 @@ def _truth(options: DemoOptions, row: int) -> tuple[Trajectory | None, int]:
 
 
 def frames_of(options: DemoOptions) -> dict[str, int]:
-    """Return the number of frames that each robot plays."""
+    """Return the number of frames that each robot plays, by the robot's name."""
     return {f"robot-{row + 1}": _truth(options, row)[1] for row in range(options.robots)}
 
 
@@ -108,7 +113,11 @@ def complete_records(
     kind: str,
     **more: Any,
 ) -> None:
-    """Write parameters with *more* of them before the events, and samples in the format of the monitor."""
+    """Turn the records of the demo in *folder* into those of an experiment, in place.
+
+    An event with the parameters of the run, of which *more* are some, is put before the other events; the
+    samples of the demo are converted to those of the monitor.  *frames* is the number of frames by robot.
+    """
     first = {
         "time": 0.0,
         "action": "experiment",
@@ -130,7 +139,7 @@ def complete_records(
 
 
 def _samples(rows: list[dict[str, Any]]) -> Iterator[MonitorSample]:
-    """Yield a sample for each time but the first, with the CPU that was used since the one before."""
+    """Yield a monitor sample for each time in *rows* but the first, with the CPU since the previous time."""
     moments: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
         moments.setdefault(row["time"], {})[row["server"]] = row
@@ -155,7 +164,9 @@ def _server(row: dict[str, Any], before: dict[str, Any], took_s: float) -> Serve
 
 
 def map_figures(records: Records) -> dict[str, Any]:
-    """Return figures of the commands, and for each robot frames, path, errors and points of its cloud.
+    """Return the figures of a mapping run: those of its commands, and lists with a value for each robot.
+
+    The lists are frames, lost frames, frame rate, length of the path, ATE and RPE, and points of the cloud.
 
     Raises:
         UsageError: The events do not hold the parameters of the run, or a trajectory cannot be read.
@@ -171,7 +182,7 @@ def map_figures(records: Records) -> dict[str, Any]:
 
 
 def map_page(report: Mapping[str, Any]) -> str:
-    """Return ``report.md``."""
+    """Return the text of ``report.md`` for *report*."""
     names = ("frames", "lost_frames", "fps_per_robot", "path_m", "ate_cm", "rpe_cm", "rpe_deg", "map_points")
     rows = [
         [f"robot-{row + 1}", *(number(report[name][row]) for name in names)]

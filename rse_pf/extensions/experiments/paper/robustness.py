@@ -1,7 +1,7 @@
-"""The robustness experiment: the paper's Sect. 6.2 fault by fault, each on a platform of its own.
+"""The robustness experiment: the faults of the paper's Sect. 6.2, each on a platform of its own.
 
-Every fault is a real one (a signal, a cut link), under real PnP load; the records of each run stay in a
-folder of their own, and a missed target is reported as missed.
+Every fault is a real one (a signal, a cut link) under a load of real PnP problems.  The records of each run
+stay in a folder of their own, and the report says for each target whether the run met it.
 """
 
 from __future__ import annotations
@@ -58,15 +58,21 @@ __all__ = [
 ]
 
 FIGURE = "robustness.png"
+# Seconds under load before the fault.
 _BEFORE_FAULT_S = 4.0
+# Longest wait until all robots have joined, in seconds.
 _JOIN_TIMEOUT_S = 60.0
+# Link profile of a fault that cuts the link: without delay.
 _NO_DELAY = "none"
-_SHORT, _SHORT_ROBOTS = ("kill", "wifi"), "20"
+# Faults of the short run with which ``verify --rerun`` checks this experiment.
+_SHORT_FAULTS = ("kill", "wifi")
+# Robots of that short run.
+_SHORT_ROBOTS = "20"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobustnessOptions:
-    """Options of the command line; *speed* shortens the duration of the faults, nothing else."""
+    """Options of the experiment; ``speed`` divides the duration of the faults and nothing else."""
 
     out: Path
     robots: int = 100
@@ -79,7 +85,10 @@ class RobustnessOptions:
 
 
 def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> int:
-    """Run the faults, write records, report and figure; return 1 if a command was lost or duplicated."""
+    """Run the faults, write records, report and figure to ``options.out``, and print a line for each run.
+
+    Return 1 if a command was lost or answered twice, else 0.
+    """
     require_matplotlib()
     # One server must be able to serve the robots of another one: give it a worker for each of two cores.
     settings = settings.replace(
@@ -91,8 +100,8 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
     load_before = load_average()
     runs: dict[str, dict[str, Any]] = {}
     for scenario in options.only or [name for name, fault in SCENARIOS.items() if not fault.slow]:
-        for turn in range(options.repeat):
-            name = scenario if options.repeat == 1 else f"{scenario}-{turn + 1}"
+        for repetition in range(options.repeat):
+            name = scenario if options.repeat == 1 else f"{scenario}-{repetition + 1}"
             (folder / name).mkdir()
             asyncio.run(_run(options, settings, folder / name, scenario, options.seed + len(runs)))
             runs[name] = robustness_figures(read_records(folder / name))
@@ -113,8 +122,8 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
 
 
 def _rerun_plan(faults: Sequence[str]) -> dict[str, Any]:
-    """Return the short form: two faults, or the first, with fewer robots."""
-    short = [name for name in _SHORT if name in faults] or [faults[0]]
+    """Return the plan of a short run: "kill" and "wifi" if among *faults*, else the first, with 20 robots."""
+    short = [name for name in _SHORT_FAULTS if name in faults] or [faults[0]]
     bars = {f"{name}/{figure}": bar for name in short for figure, bar in BARS.get(name, _NO_LOSS).items()}
     return rerun_plan(["--robots", _SHORT_ROBOTS, "--only", ",".join(short)], bars)
 
@@ -124,7 +133,7 @@ async def _run(
 ) -> None:
     scenario, session = SCENARIOS[name], settings.session
     seconds = scenario.seconds / options.speed
-    if scenario.needs_link:  # a cut must last longer than the ping timeout of the robots
+    if scenario.needs_link:  # a cut must be longer than the time in which robots detect a lost connection
         seconds = max(seconds, 2 * (session.ping_interval_s + session.ping_timeout_s))
     parameters = {
         "kind": "robustness",
@@ -198,10 +207,12 @@ BARS: dict[str, dict[str, tuple[float, str]]] = {
         "descriptors_percent": (5.0, "<="),
     },
 }
-"""The target of each figure of each scenario; ``bars`` of the report."""
+"""The targets of each scenario: limit and comparison that must hold, by the path of the figure."""
 
+# Largest deviation of a server's robots from the mean of all servers that counts as even, as a ratio.
 _EVEN = 0.2
-_CLOCK_S = 0.05  # between the decision to deliver and the time stamp in the record
+# Time between the decision of the SDK to deliver an answer and the time stamp in the record, in seconds.
+_CLOCK_S = 0.05
 
 
 def robustness_figures(records: Records) -> dict[str, Any]:
@@ -235,12 +246,12 @@ def robustness_figures(records: Records) -> dict[str, Any]:
 
 
 def find_missed_bars(figures: Mapping[str, Any]) -> list[str]:
-    """Return the figures that missed their targets."""
+    """Return the names of the figures that missed their targets."""
     return [name for name, bar in figures["bars"].items() if not bar["held"]]
 
 
 def robustness_page(report: Mapping[str, Any]) -> str:
-    """Return ``report.md``: a table of figures, and each target with whether it was met."""
+    """Return the text of ``report.md``: a table of figures, and each target with whether it was met."""
     runs: Mapping[str, Mapping[str, Any]] = report["runs"]
     rows = [
         [
@@ -275,9 +286,10 @@ def robustness_page(report: Mapping[str, Any]) -> str:
 
 
 def time_until_even_s(samples: Sequence[MonitorSample], since_s: float) -> float | None:
-    """Return the time until the robots per healthy server were within 20 % of their mean, and stayed so.
+    """Return the seconds from *since_s* until the robots were evenly distributed over the healthy servers.
 
-    Seconds after *since_s*; None if that never happened.
+    Even means that the number of each server is within 20 % of the mean, or within one robot, until the end
+    of the samples.  None if that was never reached.
     """
     reached = None
     for sample in samples:
@@ -287,7 +299,7 @@ def time_until_even_s(samples: Sequence[MonitorSample], since_s: float) -> float
         if not sum(counts):
             continue  # no robot is connected any more
         mean = sum(counts) / len(counts)
-        # The share of a server changes by whole robots.
+        # A server has a whole number of robots: a deviation of one is always accepted.
         even = all(abs(count - mean) <= max(_EVEN * mean, 1.0) for count in counts)
         if not even:
             reached = None
@@ -323,7 +335,10 @@ def _scenario_figures(scenario: str, records: Records, faults: Sequence[Event]) 
 
 
 def _outages(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
-    """Return the outages of the robots that a fault affected; of several faults, the worst of each robot."""
+    """Return how many robots *faults* affected, and percentiles of each one's longest outage (s).
+
+    A fault of a server affects the robots connected to that server, every other fault affects all robots.
+    """
     if not faults:
         return {"robots": 0, "p50": None, "p99": None, "max": None}
     everyone = {command.robot for command in records.commands}
@@ -336,7 +351,10 @@ def _outages(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
 
 
 def _out_of_rotation_s(events: Sequence[Event], faults: Sequence[Event]) -> float | None:
-    """Return the longest time from the fault of a server until the load balancer sent no robot to it."""
+    """Return the longest time (s) from a fault of a server until the load balancer took it out of rotation.
+
+    None if no fault had a server, or if a server stayed in rotation.
+    """
     times = []
     for fault in faults:
         if fault.get("server") is None:
@@ -355,7 +373,7 @@ def _out_of_rotation_s(events: Sequence[Event], faults: Sequence[Event]) -> floa
 
 
 def _adoption(events: Sequence[Event]) -> dict[str, Any]:
-    """Compare the processes before the control plane was killed with those that it adopted."""
+    """Return how many processes ran before and after the fault, how many only before, and its length (s)."""
     ran: dict[str, set[int]] = {"before": set(), "after": set()}
     for event in events:
         if event["action"] == "processes":
@@ -368,7 +386,11 @@ def _adoption(events: Sequence[Event]) -> dict[str, Any]:
 
 
 def _measure_cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
-    """Return the figures of a cut link: when both sides noticed, and the first answers after it healed."""
+    """Return the figures of a cut link, in seconds.
+
+    They are the times until robots and servers noticed the cut, and the times from its end to the first
+    answer of each robot.  ``stale_as_fresh`` counts answers that were delivered after their deadline.
+    """
     healed = [float(event["time"]) for event in records.events if event["action"] == "healed"]
     noticed: dict[str, float] = {}
     for event in records.events:
@@ -395,7 +417,7 @@ def _spread(values: Sequence[float]) -> dict[str, Any]:
 
 
 def _time_until_empty_s(samples: Sequence[MonitorSample], faults: Sequence[Event]) -> float | None:
-    """Return the time from the fault until no server had a robot; None if that never happened."""
+    """Return the seconds from the first fault until no server had a robot; None if that never happened."""
     for sample in samples:
         after = bool(faults) and sample.time >= faults[0]["time"]
         if after and sample.servers and not any(server.robots for server in sample.servers):
@@ -413,7 +435,10 @@ def _first_answers(commands: Sequence[CommandRecord], healed_s: float) -> list[f
 
 
 def _growth(events: Sequence[Event]) -> dict[str, Any]:
-    """Return the growth of memory and file descriptors per process, in percent of the start."""
+    """Return the growth of memory and of file descriptors per process during the run, in percent.
+
+    None if unknown.
+    """
     seen = {str(event["when"]): event for event in events if event["action"] == "resources"}
     if not {"before", "after"} <= set(seen):
         return {"memory_percent": None, "descriptors_percent": None}
@@ -427,7 +452,10 @@ def _growth(events: Sequence[Event]) -> dict[str, Any]:
 
 
 def _after(events: Sequence[Event], first: str, then: str) -> float | None:
-    """Return the longest time from an event *first* to the next event *then*."""
+    """Return the longest time (s) from an event *first* to the next event *then*.
+
+    None if there is no such pair, or if the last *first* is not followed by a *then*.
+    """
     waits, began = [], None
     for event in events:
         if event["action"] == first and began is None:

@@ -1,7 +1,7 @@
 """Check a report against its raw records, and the records against the invariants of every run.
 
-No figure is taken from ``report.json``: the figures are computed again from commands, events and samples,
-and only then compared, so that an edited record and an edited report both show.
+All figures are computed again from commands, events and samples, and compared with those in ``report.json``,
+so that a change of a record or of the report is found.
 """
 
 from __future__ import annotations
@@ -32,13 +32,17 @@ __all__ = [
     "verify",
 ]
 
+# Largest difference between a round trip and its time stamps that rounding explains, in ms.
 _CLOCK_MS = 0.01
-_OF_CLOUDS = "map_points"
+# The figure that needs the point clouds, which shipped results may lack.
+_CLOUD_FIGURE = "map_points"
+# A value in the output is cut after this many characters.
 _MAX_SHOWN = 60
-_OF_FRAMES = {"map", "live", "live-fault"}
-"""Kinds whose robots plan frames, not commands."""
+# Experiments whose round trips count from the real send time: their robots plan frames, not commands.
+_FRAME_EXPERIMENTS = {"map", "live", "live-fault"}
 _HINT = "name the --out of an experiment"
 
+# The function that computes the figures of a run, by the kind of its experiment.
 FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
     "elasticity": elasticity_figures,
     "latency": latency_figures,
@@ -51,20 +55,23 @@ FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FigureCheck:
-    """One line of the result; ``agrees`` is None for a figure whose records are not kept."""
+    """The check of one figure or invariant; ``agrees`` is None for a figure whose records were not kept."""
 
     what: str
     agrees: bool | None
     detail: str = ""
 
     def __str__(self) -> str:
-        """Return the line as it is printed."""
+        """Return the check as the line that is printed: outcome, name and detail."""
         outcome = "skipped" if self.agrees is None else "agrees" if self.agrees else "DIFFERS"
         return f"{outcome:<7}  {self.what}  {self.detail}".rstrip()
 
 
 def figures_of(records: Records) -> dict[str, Any]:
-    """Return the figures of a run; raises UsageError for a run of no known experiment."""
+    """Return the figures of a run, computed from *records*.
+
+    Raises UsageError if its experiment is unknown.
+    """
     kind = str(parameters_of(records).get("kind"))
     if kind not in FIGURES:
         raise UsageError(
@@ -74,10 +81,12 @@ def figures_of(records: Records) -> dict[str, Any]:
 
 
 def run_folders(folder: Path) -> dict[str, Path]:
-    """Return the runs of an experiment by their names in its report; a single run is named ``""``.
+    """Return the folder of each run of an experiment, by the run's name in the report.
+
+    The name is ``""`` if *folder* itself holds the records of a single run.
 
     Raises:
-        UsageError: There is no run.
+        UsageError: There are no records of a run in *folder*.
     """
     if (folder / EVENTS).exists():
         return {"": folder}
@@ -88,7 +97,7 @@ def run_folders(folder: Path) -> dict[str, Path]:
 
 
 def verify(folder: Path) -> list[FigureCheck]:
-    """Return a check of each figure and invariant of each run in *folder*, or in the experiments below it.
+    """Check each figure and invariant of each run in *folder*, or of the experiments in its folders.
 
     Raises:
         UsageError: The folder holds no run, or a record or the report cannot be read.
@@ -112,13 +121,16 @@ def verify(folder: Path) -> list[FigureCheck]:
 
 
 def report_folders(folder: Path) -> list[Path]:
-    """Return the experiments in *folder*: itself, or those below it that have a report."""
+    """Return *folder* if it has a report, else its folders that have one.
+
+    *folder* again if there are none.
+    """
     below = [report.parent for report in sorted(folder.glob("*/report.json"))]
     return [folder] if (folder / "report.json").exists() or not below else below
 
 
 def broken_invariants(records: Records) -> dict[str, str]:
-    """Return each invariant of a run with what breaks it; an empty text for one that holds."""
+    """Return for each invariant, by its sentence, how the run violates it; an empty text if it holds."""
     commands = figures_of(records)["commands"]
     invariants = {
         "every command came to an end": _if(commands["lost"], f"{commands['lost']} lost"),
@@ -142,8 +154,8 @@ def _verify_run(folder: Path, reported: Mapping[str, Any]) -> Iterator[FigureChe
     records = read_records(folder)
     figures = json.loads(json.dumps(figures_of(records)))
     for path, value in _leaves(figures):
-        if path == (_OF_CLOUDS,) and None in value:
-            yield FigureCheck(what=_OF_CLOUDS, agrees=None, detail=f"{CLOUD} is not kept here")
+        if path == (_CLOUD_FIGURE,) and None in value:
+            yield FigureCheck(what=_CLOUD_FIGURE, agrees=None, detail=f"{CLOUD} is not kept here")
         else:
             yield _compare(reported, path, value)
     for name, broken in broken_invariants(records).items():
@@ -156,13 +168,13 @@ def _prefix(name: str, check: FigureCheck) -> FigureCheck:
 
 
 def _wrong_round_trip(records: Records) -> str:
-    mapping = parameters_of(records)["kind"] in _OF_FRAMES
+    mapping = parameters_of(records)["kind"] in _FRAME_EXPERIMENTS
     for command in records.commands:
         if command.code != "ok" or command.answered is None or command.round_trip_ms is None:
             continue
         trip_ms = 1000.0 * (command.answered - (command.sent if mapping else command.planned))
         over_ms = trip_ms - command.round_trip_ms
-        # A mapping robot does work of its own between the round trip and the time stamp.
+        # A mapping robot does other work between the end of the round trip and the time stamp of the answer.
         wrong = over_ms < -_CLOCK_MS if mapping else abs(over_ms) > _CLOCK_MS
         if command.answered < command.sent or wrong:
             return (
@@ -196,7 +208,7 @@ def _leaves(
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """Return the report in *folder*; raises UsageError."""
+    """Return ``report.json`` of *folder*; raises UsageError if it cannot be read or is no JSON object."""
     path = folder / "report.json"
     report = read_document(path, "a report", hint=_HINT)
     if not isinstance(report, dict):

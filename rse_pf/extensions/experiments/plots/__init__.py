@@ -1,4 +1,4 @@
-"""Pictures of runs and maps, as PNG files and in a browser.
+"""PNG images of experiment runs, maps and trajectories.
 
-Drawing belongs here; computing what is drawn belongs to `results`.
+This package draws; the package `results` computes the numbers that are drawn.
 """

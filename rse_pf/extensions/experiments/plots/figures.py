@@ -1,6 +1,7 @@
-"""The figures of the experiments, with the axes of the paper and its numbers beside the measured ones.
+"""The figures of the experiments: measured values on the axes of the RSE-PF paper, with the paper's numbers.
 
-Each function takes records or figures of a report and writes one PNG; no window opens.
+Each public ``draw_`` function takes the records of runs or the figures of a report and writes one PNG file
+with Matplotlib; no window opens.
 """
 
 from __future__ import annotations
@@ -29,18 +30,24 @@ _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#c0392b"
 _PARTS_COLOURS = {"up_ms": "#7aa6d6", "queue_ms": _ORANGE, "compute_ms": _GREEN, "down_ms": _BLUE}
 _PARTS_NAMES = {"up_ms": "up", "queue_ms": "queue", "compute_ms": "compute", "down_ms": "down"}
 _TRANSMISSION = "transmission, not split"
+# Number of bins of equal width along the time axis over which round trips and failures are aggregated.
 _BINS = 80
-_MAX_PERCENT = 170.0  # emulated cores limit what is started, not what is used: peaks exceed 100 %
+# Upper limit of the CPU axis: a server with emulated cores limits the requests that it starts, not the CPU
+# time that they use, so that peaks exceed 100 %.
+_MAX_PERCENT = 170.0
 _DPI = 130
 
 
 def require_matplotlib() -> None:
-    """Raise MissingExtra unless figures can be drawn; called before a run, not after it."""
+    """Raise MissingExtra if Matplotlib is not installed; experiments call this before a run, not after it."""
     _pyplot()
 
 
 def draw_elasticity(path: Path, runs: Mapping[str, Records]) -> None:
-    """Draw the paper's Fig. 8 and, below it, round trips and robots per server; a column for each run.
+    """Draw one column of three plots for each elasticity run.
+
+    From top to bottom: mean CPU and number of healthy servers (the paper's Fig. 8), round trips, and robots
+    on each server.
 
     Args:
         path: Path of the PNG.
@@ -71,7 +78,11 @@ def draw_elasticity(path: Path, runs: Mapping[str, Records]) -> None:
 
 
 def draw_latency(path: Path, figures: Mapping[str, Any], caption: str) -> None:
-    """Draw the mean round trip of the paper and of the run as stacked bars, and percentiles of the run."""
+    """Draw the latency experiment into the PNG *path*, with *caption* as its title.
+
+    Left: the mean round trip of the paper and that of the run as stacked bars of its parts.  Right: p50, p95,
+    p99 and maximum of the run's round trips.  *figures* are those of `latency_figures`.
+    """
     figure, (bars, shares) = _pyplot().subplots(
         1, 2, figsize=(10.5, 4.8), layout="constrained", width_ratios=(1.1, 1.0)
     )
@@ -98,7 +109,11 @@ def draw_latency(path: Path, figures: Mapping[str, Any], caption: str) -> None:
 
 
 def draw_robustness(path: Path, runs: Mapping[str, Records], rows: Mapping[str, Mapping[str, Any]]) -> None:
-    """Draw for each fault the round trips of its commands, and whether its targets were met."""
+    """Draw one plot per run of a fault: the round trip of each command over its planned send time.
+
+    *runs* and *rows* have the same keys, the names of the runs; a row holds the figures of its run.  The
+    title of a plot says whether all targets of the fault were met.
+    """
     columns = 1 if len(runs) == 1 else 2
     lines = -(-len(runs) // columns)
     figure, axes = _pyplot().subplots(
@@ -118,7 +133,14 @@ def draw_robustness(path: Path, runs: Mapping[str, Records], rows: Mapping[str, 
 def draw_live(
     path: Path, drives: Sequence[LiveDrive], version: MapVersion | None, live: Mapping[str, Any]
 ) -> None:
-    """Draw the paths in a live map, the errors of the poses as given out, and the delays of corrections."""
+    """Draw a run with a live map into the PNG *path*, as three plots.
+
+    Left: the path of each robot in the map, dotted while the robot was not yet aligned with it, with the
+    poses that the robot reported while it drove as dots.  Middle: the error of those reported poses over
+    time.  Right: the cumulative distribution of the time from a keyframe to the correction of it.  *version*
+    is the map that was published at the end, or None if there is none; *live* are the figures of
+    `live_figures`.
+    """
     figure, (paths, errors, delays) = _pyplot().subplots(
         1, 3, figsize=(16.0, 4.8), layout="constrained", width_ratios=(1.2, 1.1, 1.1)
     )
@@ -157,15 +179,12 @@ def draw_live(
 
 
 def _widest_axes(positions: Sequence[Any]) -> tuple[int, int]:
-    """Return the two axes along which the robots moved most."""
+    """Return the two world axes with the largest extent of *positions*, ascending; (0, 2) without any."""
     if not positions:
         return 0, 2
     spread = np.ptp(np.concatenate(positions), axis=0)
     first, second = sorted(int(axis) for axis in np.argsort(spread)[1:])
     return first, second
-
-
-# --- elasticity ------------------------------------------------------------------------------
 
 
 def _servers(axis: Any, records: Records, parameters: Mapping[str, Any]) -> None:
@@ -209,7 +228,10 @@ def _servers(axis: Any, records: Records, parameters: Mapping[str, Any]) -> None
 
 
 def _round_trips(axis: Any, records: Records) -> None:
-    """Draw percentiles over bins of planned time, and the largest median of a single robot."""
+    """Draw p50 and p99 of the round trips per bin of planned send time, and failures as bars.
+
+    A third line is the largest median of a single robot in each bin.
+    """
     done = [
         command for command in records.commands if command.code == "ok" and command.round_trip_ms is not None
     ]
@@ -266,7 +288,10 @@ def _server_number(name: str) -> tuple[int, str]:
 def _bin_commands(
     commands: Sequence[CommandRecord], among: Sequence[CommandRecord]
 ) -> tuple[Any, list[list[CommandRecord]]]:
-    """Return the edges of equal bins over the times of *among*, and the *commands* in each bin."""
+    """Return the edges of `_BINS` bins of equal width, and for each bin the *commands* planned within it.
+
+    The bins span the planned send times of *among*, which includes commands that *commands* does not.
+    """
     planned = [record.planned for record in among] or [0.0, 1.0]
     edges = np.linspace(min(planned), max(planned) + 1e-6, _BINS + 1)
     bins: list[list[CommandRecord]] = [[] for _ in range(_BINS)]
@@ -284,12 +309,9 @@ def _worst_robot(commands: Sequence[CommandRecord]) -> float:
 
 
 def _period_means(times: Sequence[float], values: Sequence[float], period_s: float) -> list[float]:
-    """Return at each time the mean over the period before it, as the monitor computes it."""
+    """Return for each of *times* the mean of the *values* in the *period_s* seconds up to that time."""
     at, known = np.array(times), np.array(values)
     return [float(known[(at > t - period_s) & (at <= t)].mean()) for t in times]
-
-
-# --- latency and robustness ------------------------------------------------------------------
 
 
 def _stack_bars(axis: Any, figures: Mapping[str, Any]) -> None:
@@ -362,7 +384,7 @@ def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> No
 
 
 def _log_ms(axis: Any, values: Sequence[float]) -> None:
-    """Scale *axis* logarithmically, with space for a legend above the largest value."""
+    """Give *axis* a logarithmic y scale for *values* in ms, with space for a legend above them."""
     low, high = min(values, default=1.0), max(values, default=1.0)
     axis.set(yscale="log", ylim=(max(low / 2, 0.3), max(4 * high, 1000.0)))
     axis.yaxis.set_major_formatter("{x:g}")

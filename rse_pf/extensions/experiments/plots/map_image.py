@@ -1,6 +1,6 @@
 """The image of a map (the paper's Fig. 7): a coloured point cloud with the paths of its cameras.
 
-Drawn with Pillow alone, because matplotlib and its fonts would be a fifth of what the demo installs.
+It is drawn with Pillow alone, because Matplotlib and its fonts would be a fifth of what the demo installs.
 """
 
 from __future__ import annotations
@@ -19,21 +19,34 @@ from rse_pf.terminal import printable
 
 __all__ = ["COLOURS", "SCALES_M", "RobotPath", "draw_map", "fitting", "pillow"]
 
-_WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
-_BACKGROUND, _INK, _WHITE = (228, 231, 236), (30, 34, 42), (255, 255, 255)
-"""Not white, so that white surfaces differ from places without points."""
+_WIDTH = 1600  # of the image, in pixels
+_HEIGHT = 900  # of the image, in pixels
+_CAPTION = 64  # height in pixels of the strips at the top and the bottom in which no point is drawn
+_MARGIN = 40  # pixels between the border of the image and its content
+# Background of the image, as RGB: not white, so that white surfaces differ from regions without points.
+_BACKGROUND = (228, 231, 236)
+_INK = (30, 34, 42)
+_WHITE = (255, 255, 255)
 COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
-"""Distinct for colour-blind readers as well; Okabe and Ito 2008."""
+"""Colours of the paths of robots (RGB), distinct for colour-blind readers as well; Okabe and Ito 2008."""
+# Largest number of robots whose names are drawn next to their paths; with more, names stand in the legend
+# only.
 _MAX_LABELS = 8
-"""With more robots the names are in the legend only."""
+# Focal length of the camera of the image, relative: the result is scaled to fill the image afterwards.
 _FOCAL = 1.35
+# Distance along a path, in metres, after which the next camera is drawn on it.
 _CAMERA_EVERY_M = 0.5
 SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
+"""Lengths of the scale bar in metres, or in the unit of the map.
+
+The first that has a suitable length in pixels
+is used."""
+# Shortest and longest scale bar, in pixels.
 _SCALE_PX = (80.0, 400.0)
+# A scene whose horizontal extent is longer than wide by more than this ratio is drawn from its long side.
 _LONG_SCENE = 1.25
-"""A scene that is longer than wide by this ratio is seen from its side."""
+# Points more than this far above the highest camera, in metres, are a ceiling and are not drawn.
 _CEILING_M = 0.7
-"""Points this far above the highest camera are a ceiling and are not drawn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,9 +66,15 @@ def draw_map(
     *,
     unit: str = "m",
 ) -> None:
-    """Write a PNG that shows ``(n, 3)`` points obliquely from above, with the paths of the robots.
+    """Write a PNG that shows a coloured point cloud obliquely from above, with the paths of the robots.
 
-    *unit* is that of the points, as the scale bar names it.
+    Args:
+        path: Path of the PNG.
+        points_world: Points ``(n, 3)`` in the world frame.
+        colours: RGB of each point, ``(n, 3)``.
+        robots: The path of each robot in the same frame.
+        caption: The line above the image; a text that is too long is cut.
+        unit: Unit of the points, which the scale bar names.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -86,7 +105,10 @@ def draw_map(
 
 
 class _Observer:
-    """A pinhole camera that looks down on the scene from the side of its robots, whose paths it shows."""
+    """The virtual pinhole camera of the image: 40 degrees downward, with all paths and most points in view.
+
+    Seen from above, it views along the mean viewing direction of the robots' cameras, or across a long scene.
+    """
 
     def __init__(self, points: Array, robots: list[RobotPath], up: Array) -> None:
         places = np.concatenate([np.zeros((0, 3)), *(robot.T_world_camera[:, :3, 3] for robot in robots)])
@@ -110,7 +132,11 @@ class _Observer:
 
     @staticmethod
     def _side(points: Array, robots: list[RobotPath], up: Array) -> Array:
-        """Return the mean viewing direction of the robots, or the short axis of a long scene, level."""
+        """Return the horizontal unit vector along which the scene is viewed.
+
+        This is the mean viewing direction of the robots' cameras, or the short horizontal axis of a long
+        scene.
+        """
         looks = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
         mean = looks.mean(axis=0) if len(looks) else np.zeros(3)
         level = np.eye(3) - np.outer(up, up)
@@ -127,12 +153,12 @@ class _Observer:
         return side
 
     def depth(self, points: Array) -> Array:
-        """Return the distances along the line of sight, metres."""
+        """Return the distances ``(n,)`` of points from the virtual camera along its optical axis (m)."""
         depth: Array = (points - self.centre) @ self.axis_z + 1.6 * self.distance
         return depth
 
     def project(self, points: Array) -> Array:
-        """Return the ``(n, 2)`` pixels of the image."""
+        """Return the pixels ``(n, 2)`` of the image at which *points* ``(n, 3)`` appear."""
         return self._flat(points) + self.shift
 
     def _flat(self, points: Array) -> Array:
@@ -143,7 +169,10 @@ class _Observer:
 
 
 def _bounds(points: Array, places: Array, percentiles: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the least and the greatest of each axis: of points by percentiles, of places of all."""
+    """Return the lower and the upper bound of each axis over all *places* and most *points*.
+
+    Of *points* only the two *percentiles* count, so that outliers do not extend the bounds.
+    """
     if len(points):
         places = np.concatenate([places, np.percentile(points, percentiles, axis=0)])
     if not len(places):
@@ -152,7 +181,7 @@ def _bounds(points: Array, places: Array, percentiles: tuple[float, float]) -> t
 
 
 def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Draw the points, nearest on top, each as a small square."""
+    """Return the image ``(height, width, 3)`` of the points: each a small square, near ones over far ones."""
     picture = np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
     picture[:] = _BACKGROUND
     if not len(points):
@@ -170,7 +199,7 @@ def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> np
 
 
 def _splat_size(pixels: npt.NDArray[np.int64]) -> int:
-    """Return the size of squares that just closes the gaps between neighbours."""
+    """Return the side, 1 to 4 pixels, of squares that close the gaps between neighbouring points."""
     spread = np.percentile(pixels, 98, axis=0) - np.percentile(pixels, 2, axis=0)
     area_per_pixel = float(spread[0] * spread[1]) / max(1, len(pixels))
     return int(np.clip(round(math.sqrt(2.5 * area_per_pixel)), 1, 4))
@@ -187,7 +216,10 @@ def _draw_path(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, 
 
 
 def _draw_ends(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, int, int]) -> None:
-    """Draw start and end; the ring is wide enough to show around the start of another robot."""
+    """Draw a dot at the start and a ring at the end of the path of *robot*.
+
+    The ring is wider than the dot, so that both show where one robot ends at the start of another.
+    """
     if not len(robot.T_world_camera):
         return
     (x0, y0), (x1, y1) = view.project(robot.T_world_camera[[0, -1], :3, 3])
@@ -197,7 +229,10 @@ def _draw_ends(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, 
 
 
 def _label_places(view: _Observer, robots: list[RobotPath]) -> list[tuple[float, float]]:
-    """Return for each robot the place beside its path that is farthest from the other paths."""
+    """Return for each robot the pixel at which its name is drawn: near its path, far from the other paths.
+
+    A robot without a path gets a pixel outside the image.
+    """
     lines = [view.project(robot.T_world_camera[:, :3, 3]) for robot in robots]
     places = []
     for number, line in enumerate(lines):
@@ -221,7 +256,7 @@ def _label_places(view: _Observer, robots: list[RobotPath]) -> list[tuple[float,
 
 
 def _draw_legend(draw: Any, robots: list[RobotPath], font: Any, max_px: float) -> None:
-    """Draw one line of names; those that do not fit are counted."""
+    """Draw one line with the names of the robots; for the names that do not fit, write "and N more"."""
     left, y = _MARGIN, _HEIGHT - 34
     for number, robot in enumerate(robots):
         label = f"{robot.name} (dot: start, ring: end)" if number == 0 else robot.name
@@ -235,7 +270,7 @@ def _draw_legend(draw: Any, robots: list[RobotPath], font: Any, max_px: float) -
 
 
 def fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
-    """Return *text*, cut to *max_px*."""
+    """Return *text*, cut and with " ..." at its end if it is wider than *max_px* pixels in *font*."""
     if draw.textlength(text, font=font) <= max_px:
         return text
     while text and draw.textlength(f"{text} ...", font=font) > max_px:
@@ -244,7 +279,7 @@ def fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
 
 
 def _thin_out(poses: Array) -> list[Array]:
-    """Return the first pose, and each that is far enough from the last one returned."""
+    """Return the first pose, and each pose at least `_CAMERA_EVERY_M` away from the last returned pose."""
     chosen = [poses[0]]
     for pose in poses[1:]:
         if np.linalg.norm(pose[:3, 3] - chosen[-1][:3, 3]) >= _CAMERA_EVERY_M:
@@ -262,7 +297,10 @@ def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tupl
 
 
 def _draw_scale(draw: Any, view: _Observer, font: Any, unit: str) -> float:
-    """Draw a bar of a round length, as long as it appears at the centre; return its left end."""
+    """Draw the scale bar at the lower right; return the x at which its label begins, in pixels.
+
+    The bar has a round length in *unit*, as long as that length appears at the centre of the scene.
+    """
     ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
     one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
     units = next((m for m in SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
@@ -276,7 +314,7 @@ def _draw_scale(draw: Any, view: _Observer, font: Any, unit: str) -> float:
 
 
 def _up(robots: list[RobotPath]) -> Array:
-    """Return the mean upward direction of the cameras: their -y axes."""
+    """Return the unit vector of the mean upward direction of all cameras, which is their -y axis."""
     if not sum(len(robot.T_world_camera) for robot in robots):
         return np.array([0.0, -1.0, 0.0])
     mean = -np.concatenate([robot.T_world_camera[:, :3, 1] for robot in robots]).mean(axis=0)
@@ -294,7 +332,10 @@ def _below_ceiling(
 
 
 def pillow() -> tuple[Any, Any, Any]:
-    """Return the modules of images, drawing and fonts; raises MissingExtra without Pillow."""
+    """Return Pillow's modules Image, ImageDraw and ImageFont.
+
+    Raises MissingExtra if Pillow is not installed.
+    """
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:

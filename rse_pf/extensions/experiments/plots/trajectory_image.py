@@ -1,6 +1,7 @@
-"""The image of trajectories beside the truth: a panel for each recording, across the path's shortest axis.
+"""The image of estimated trajectories and the true one, with a panel for each recording.
 
-Drawn with Pillow, like the image of a map.
+A panel shows the plane of the two longest axes of the true path.  The image is drawn with Pillow, like the
+image of a map.
 """
 
 from __future__ import annotations
@@ -20,17 +21,27 @@ from rse_pf.terminal import printable
 
 __all__ = ["DrawnPath", "Panel", "draw_trajectories", "pieces"]
 
-_WIDTH, _HEIGHT, _TITLE, _LEGEND, _MARGIN, _ACROSS = 800, 640, 48, 92, 28, 2
-_PAPER, _INK, _TRUTH, _FRAME = (255, 255, 255), (30, 34, 42), (150, 156, 166), (228, 231, 236)
+_WIDTH = 800  # of a panel, in pixels
+_HEIGHT = 640  # of a panel, in pixels
+_TITLE = 48  # height of a panel's title, in pixels
+_LEGEND = 92  # height of a panel's legend, in pixels
+_MARGIN = 28  # pixels between the border of a panel and its content
+_ACROSS = 2  # panels in a row of the image
+_PAPER = (255, 255, 255)
+_INK = (30, 34, 42)
+_TRUTH = (150, 156, 166)
+_FRAME = (228, 231, 236)
+# A path is not drawn across a gap of more than this many times the median interval between poses.
 _BREAK = 2.5
-"""A path is broken where poses are so many times their usual interval apart."""
+# Shortest and longest scale bar, in pixels.
 _SCALE_PX = (60.0, 300.0)
+# Largest number of panels in an image.
 _MOST_PANELS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnPath:
-    """A path with the name that stands in the legend."""
+    """An estimated path with its name in the legend."""
 
     name: str
     path: Trajectory
@@ -38,7 +49,10 @@ class DrawnPath:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Panel:
-    """The paths of one recording and their truth, all in one frame; *unit* is that of the scale bar."""
+    """The estimated paths of one recording and the true path, or None, all in the same coordinate frame.
+
+    ``unit`` is the unit of the positions, which the scale bar names.
+    """
 
     title: str
     truth: Trajectory | None
@@ -47,7 +61,7 @@ class Panel:
 
 
 def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
-    """Write a PNG with a panel for each recording; those beyond 24 are left out.
+    """Write a PNG with a panel for each of the first 24 recordings; the others are left out.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -65,7 +79,10 @@ def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
 
 
 def pieces(trajectory: Trajectory) -> list[Array]:
-    """Return the ``(n, 3)`` positions of each part of a path without lost frames in between."""
+    """Return the positions ``(n, 3)`` of each part of a path within which no frames were lost.
+
+    A part ends where the next pose is more than 2.5 times the median interval away in time.
+    """
     if not len(trajectory):
         return []
     apart_s = np.diff(trajectory.timestamps_s)
@@ -114,7 +131,7 @@ def _draw_panel(draw: Any, panel: Panel, corner: tuple[int, int], fonts: tuple[A
 
 
 def _basis(positions: Array) -> Array:
-    """Return ``(3, 2)``, the two longest axes of the positions."""
+    """Return the unit vectors of the two longest axes of *positions* ``(n, 3)`` as columns of ``(3, 2)``."""
     centred = positions - positions.mean(axis=0)
     _, _, axes = np.linalg.svd(centred.T @ centred)
     basis: Array = axes[:2].T
@@ -131,7 +148,7 @@ def _draw_scale(draw: Any, scale: float, end: tuple[float, float], unit: str, fo
 def _draw_legend(
     draw: Any, entries: Sequence[tuple[str, tuple[int, int, int]]], corner: tuple[float, float], font: Any
 ) -> None:
-    """Draw names with their colours, in as many lines as fit; the rest is counted."""
+    """Draw names with their colours, in as many lines as fit; for the other names, write "and N more"."""
     left, y = corner
     x, right, last = left, left + _WIDTH - 2 * _MARGIN, y + _LEGEND - 40
     for number, (name, colour) in enumerate(entries):

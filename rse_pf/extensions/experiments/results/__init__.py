@@ -1,4 +1,4 @@
-"""Records of a run, what follows from them, and the check that a report follows from its records.
+"""The records of a run, and the figures that are computed from them.
 
-Pure functions over records belong here; starting anything does not.
+The modules read and write files of records and compute figures; none of them starts a platform or robots.
 """

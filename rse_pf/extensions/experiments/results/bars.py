@@ -1,4 +1,4 @@
-"""Figures of a run compared with the bars that they must meet."""
+"""The comparison of a run's figures with their targets, which reports call bars."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 __all__ = ["Bars", "with_bars"]
 
 Bars = Mapping[str, tuple[float, str]]
-"""Path of a figure, as ``gap_s/p99``, to its bar and ``<=`` or ``>=``."""
+"""Targets of figures: limit and ``<=`` or ``>=``, by the path of the figure, such as ``gap_s/p99``."""
 
 
 def with_bars(figures: Mapping[str, Any], bars: Bars) -> dict[str, Any]:
-    """Return *figures* with ``bars``: value, bar and ``held`` of each.
+    """Return *figures* with the member ``bars``: value, target and ``held`` (target met) by figure.
 
-    A figure without a value, None, does not hold.
+    A figure whose value is None does not meet its target.
     """
-    return {**figures, "bars": {name: _judge(figures, name, *bar) for name, bar in bars.items()}}
+    return {**figures, "bars": {name: _check_bar(figures, name, *bar) for name, bar in bars.items()}}
 
 
-def _judge(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
+def _check_bar(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
     value: Any = figures
     for step in name.split("/"):
         value = value[step]

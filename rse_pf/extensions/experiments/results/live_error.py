@@ -1,7 +1,7 @@
-"""The figures of robots that shared a live map, from their raw records and the map that was published.
+"""The figures of robots that built a live map together, from their raw records and the published map.
 
-Records are in the folder of each robot: ``live.jsonl`` has a line for each frame, correction and keyframe,
-``truth.txt`` the true trajectory, if it is known.  The truth is used for errors alone.
+The folder of each robot holds its records: ``live.jsonl`` has a line for each frame, correction and keyframe,
+and ``truth.txt`` the true trajectory, if it is known.  The truth is used for errors only.
 """
 
 from __future__ import annotations
@@ -40,21 +40,28 @@ __all__ = [
 ]
 
 LIVE_RECORDS = "live.jsonl"
+"""Name of the file with a robot's records, in the folder of the robot."""
 LIVE_MAP = "live.rsemap"
-"""The version that the live map published at the end, in the folder of the run."""
+"""Name of the file with the map that was published at the end, in the folder of the run."""
 TRUTH = "truth.txt"
+"""Name of the file with a robot's true trajectory, in the folder of the robot."""
 
 
+# Scale in the records of a robot that measures lengths in an unknown unit.
 _UP_TO_SCALE = "up to scale"
+# Printed if no robot has a metric scale.
 _NO_METRES = (
-    "no robot has metres, so a place in the map is known of none: all have one lens alone\n"
-    "  hint: let one of them have depth, a stereo pair or an IMU: --camera stereo, --imu\n"
+    "no robot has metres, so that no robot could be aligned with the map: each has one camera without depth\n"
+    "  hint: give one robot depth, a stereo pair or an IMU: --camera stereo, --imu\n"
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LiveDrive:
-    """The records of one robot, in the order of time; times are seconds since the start of all robots."""
+    """The records of one robot in the order of time; their times are seconds since the robots started.
+
+    ``end`` holds the figures that the robot recorded at the end; ``truth`` is None if it is not known.
+    """
 
     name: str
     frames: list[dict[str, Any]]
@@ -65,12 +72,12 @@ class LiveDrive:
 
 
 def read_live_drives(folder: Path, names: Sequence[str]) -> list[LiveDrive]:
-    """Return the records of the robots in *folder*; raises UsageError."""
+    """Return the records of the robots *names* below *folder*; raises UsageError if a file cannot be read."""
     return [_read_drive(folder / name, name) for name in names]
 
 
 def read_live_map(folder: Path) -> MapVersion | None:
-    """Return the map that was published, None if there was none; raises UsageError if it is damaged."""
+    """Return the published map in *folder*; None if there is none; raises UsageError if it is damaged."""
     path = folder / LIVE_MAP
     if not path.exists():
         return None
@@ -81,12 +88,14 @@ def read_live_map(folder: Path) -> MapVersion | None:
 
 
 def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dict[str, Any]:
-    """Return ``live`` of ``report.json``.
+    """Return the member ``live`` of ``report.json``, the figures of a live map.
 
-    ``final_ate_cm`` is over all frames of the robots that are in the published map, ``online_ate_cm`` over
-    the poses as they were given out, from each robot's alignment on; both after one rigid alignment of all
-    robots to the truth.  They are None where a robot was not joined, since the others alone are easier.
-    ``correction_ms`` is from the sending of a keyframe to the corrections that it caused, at each robot.
+    ``final_ate_cm`` is the ATE of all frames, with their poses in the published map.  ``online_ate_cm`` is
+    the ATE of the poses that the robots reported while they drove, from the alignment of each robot with the
+    map on.  Both are computed after one rigid alignment of all robots together to the truth; they are None if
+    a robot is not in the map or has no truth, since the ATE of the other robots alone would be smaller.
+    ``correction_ms`` is the time from sending a keyframe to the arrival of the corrections that it caused at
+    each robot.
     """
     final = [final_trajectory(drive, version) for drive in drives]
     online = [online_trajectory(drive) for drive in drives]
@@ -130,7 +139,7 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
 
 
 def correction_delays_ms(drives: Sequence[LiveDrive]) -> list[float]:
-    """Return the time from the sending of each keyframe to each correction that it caused."""
+    """Return the time (ms) from sending a keyframe to the arrival of each correction that it caused."""
     sent = {
         (drive.name, keyframe["number"]): keyframe["sent"] for drive in drives for keyframe in drive.keyframes
     }
@@ -143,13 +152,17 @@ def correction_delays_ms(drives: Sequence[LiveDrive]) -> list[float]:
 
 
 def online_trajectory(drive: LiveDrive) -> Trajectory:
-    """Return the poses in the map as they were given out."""
+    """Return the poses in the map that the robot reported while it drove; empty if it was never aligned."""
     placed = [frame for frame in drive.frames if frame["T_map"] is not None]
     return _trajectory(placed, "T_map")
 
 
 def final_trajectory(drive: LiveDrive, version: MapVersion | None) -> Trajectory:
-    """Return the poses of all frames in the published map, by its keyframes of the same segment."""
+    """Return the poses of the robot's frames in the published map *version*.
+
+    A frame moves with the nearest keyframes of its segment; frames of a segment without a keyframe in the map
+    are left out, and all frames if *version* is None.
+    """
     keyframes = (
         []
         if version is None
@@ -176,9 +189,10 @@ def final_trajectory(drive: LiveDrive, version: MapVersion | None) -> Trajectory
 
 
 def alignment_errors(drives: Sequence[LiveDrive], version: MapVersion | None) -> list[tuple[Array, Array]]:
-    """Return, for each robot, times ``(n,)`` and distances ``(n,)`` (cm) of the poses given out to the truth.
+    """Return for each robot the times ``(n,)`` (s) and position errors ``(n,)`` (cm) of its reported poses.
 
-    The map is placed by the final trajectories; a robot without a truth, or not in the map, has no rows.
+    One rigid transform, which aligns the final trajectories of all robots with the truth, is applied to the
+    map. The arrays of a robot without a truth, or that is not in the map, are empty.
     """
     final = [_match_positions(final_trajectory(drive, version), drive.truth) for drive in drives]
     known = [pair for pair in final if pair is not None]
@@ -201,7 +215,7 @@ def alignment_errors(drives: Sequence[LiveDrive], version: MapVersion | None) ->
 
 
 def live_lines(live: Mapping[str, Any], robots: int) -> str:
-    """Return what the terminal shows of a live map, with its newline."""
+    """Return the text about a live map for the terminal; *live* are its figures; it ends with a newline."""
     delay = live["correction_ms"]
     errors = (
         f"ATE {live['final_ate_cm']:.2f} cm at the end, {live['online_ate_cm']:.2f} cm as given out; "
@@ -218,7 +232,7 @@ def live_lines(live: Mapping[str, Any], robots: int) -> str:
 
 
 def live_table(live: Mapping[str, Any]) -> list[str]:
-    """Return the table of ``report.md``."""
+    """Return the lines of the Markdown table with the figures *live*."""
     delay, acknowledged_ms = live["correction_ms"], live["keyframe_kept_ms"]
     rows = [
         ("joined", live["joined"]),
@@ -264,12 +278,18 @@ def _truth(drive: LiveDrive) -> Trajectory:
 
 
 def _join_frame(drive: LiveDrive) -> int | None:
-    """Return the first of the robot's frames, from 0, whose pose the map itself had aligned."""
+    """Return the number (from 0) of the robot's first frame aligned by the map server.
+
+    None if there is none.
+    """
     return next((row for row, frame in enumerate(drive.frames) if frame["by"] == "map"), None)
 
 
 def _match_positions(path: Trajectory, truth: Trajectory | None) -> tuple[Array, Array] | None:
-    """Return estimated and true positions ``(n, 3)``, or None if they do not match in time."""
+    """Return estimated and true positions ``(n, 3)`` at the same times.
+
+    None if there are fewer than three.
+    """
     if truth is None:
         return None
     try:
@@ -291,7 +311,7 @@ def _together_cm(paths: Iterable[Trajectory], drives: Sequence[LiveDrive]) -> fl
 
 
 def _owners(drives: Sequence[LiveDrive]) -> list[str]:
-    """Return who served the map, in the order in which robots heard of them."""
+    """Return the names of the map servers, in the order in which they first appear in the robots' records."""
     seen = sorted(
         (frame["t"], frame["owner"]) for drive in drives for frame in drive.frames if frame["owner"]
     )

@@ -1,7 +1,7 @@
-"""The figures of a live map that met a fault, from the records of the run and the log of the map.
+"""The figures of a live map during a fault, from the records of the run and the log of the map.
 
-The log in the platform's objects says which keyframes the map holds, and is replayed from its first entry;
-the records of the robots say which were acknowledged, and when.  Nothing is taken from the report.
+The log in the platform's object store is replayed from its first entry and says which keyframes the map
+holds. The records of the robots say which keyframes the map server has acknowledged, and when.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from rse_pf.extensions.experiments.results.summary import summarise
 
 __all__ = ["LIVE_FAULT_BARS", "fault_rows", "live_fault_figures"]
 
+# Faults after which another server must serve the map.
 _NEW_OWNER = {"kill", "stop", "drain", "roll"}
+# Targets of every fault: nothing that was acknowledged is lost, and the replayed log gives the same map.
 _NO_LOSS = {
     "keyframes/lost": (0.0, "<="),
     "keyframes/twice": (0.0, "<="),
@@ -42,11 +44,11 @@ LIVE_FAULT_BARS: dict[str, dict[str, tuple[float, str]]] = {
     "store": _NO_LOSS,
     "wifi": {**_NO_LOSS, "keyframes/ahead_of_poses": (0.0, "<=")},
 }
-"""The target of each figure of each fault."""
+"""The targets of each fault: limit and comparison that must hold, by the path of the figure."""
 
 
 def live_fault_figures(records: Records) -> dict[str, Any]:
-    """Return the figures of one run, and for each target whether it was met (``held``).
+    """Return the figures of one run, and for each target whether the run met it (``held``).
 
     Raises:
         UsageError: The events do not hold the parameters of the run, or a record cannot be read.
@@ -86,9 +88,10 @@ def live_fault_figures(records: Records) -> dict[str, Any]:
 
 
 def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
-    """Return the head and a row for each run, of the figures in a report.
+    """Return the rows of a table with the main figures of *runs*: first the head, then a row for each run.
 
-    The error of a run is compared with the mean of the runs without a fault among *runs*, if there are some.
+    After the ATE of a run stands its difference to the mean ATE of the runs without a fault, if there are
+    some.
     """
     undisturbed = [
         one_run["live"]["final_ate_cm"]
@@ -122,6 +125,7 @@ def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     return rows
 
 
+# The head of the table of `fault_rows`.
 _HEAD = (
     "fault", "at s", "keyframes acknowledged / in the log", "lost / twice / out of order / ahead of poses",
     "frames lost", "new owner after s (owners)", "longest acknowledgement s", "replay equal",
@@ -131,7 +135,12 @@ _HEAD = (
 
 
 def _keyframes(drives: Sequence[LiveDrive], logged: LoggedMap) -> dict[str, int]:
-    """Return counts: acknowledged, and of these lost or twice in the log; made but never acknowledged."""
+    """Return counts of keyframes, by comparing the robots' records with the log of the map.
+
+    ``waiting`` counts keyframes that were never acknowledged, ``lost`` the acknowledged ones that the log
+    lacks, ``twice`` the numbers and time stamps that occur more than once, and ``out_of_order`` those of a
+    robot that follow a later one.
+    """
     lost = twice = out_of_order = 0
     for drive in drives:
         held = [(number, stamp) for name, number, stamp in logged.keyframes if name == drive.name]
@@ -153,7 +162,10 @@ def _keyframes(drives: Sequence[LiveDrive], logged: LoggedMap) -> dict[str, int]
 
 
 def _ahead(drive: LiveDrive, commands: Sequence[CommandRecord]) -> int:
-    """Return how many keyframes were sent while a pose was asked for, which may wait for a second at most."""
+    """Return how many keyframes the robot sent while it waited for the answer to a pose request.
+
+    The wait counts for at most 1 s after the request: keyframes may be sent after that.
+    """
     asked = sorted(
         (command.sent, min(command.answered or math.inf, command.sent + 1.0))
         for command in commands
@@ -168,9 +180,10 @@ def _fault_at_s(events: Sequence[Event], started_s: float) -> float | None:
 
 
 def _new_owner_s(events: Sequence[Event]) -> float | None:
-    """Return the longest time without an owner, None if the owner never changed.
+    """Return the longest time (s) without a map server; None if the map server never changed.
 
-    From the fault, or from the release of the lease if its owner released it, to the next owner that serves.
+    It lasts from the fault, or from the release of the lease if the map server released it, until the next
+    map server serves.
     """
     fault = next((entry for entry in events if entry["action"] == "fault" and "owner" in entry), None)
     if fault is None:
@@ -188,7 +201,7 @@ def _new_owner_s(events: Sequence[Event]) -> float | None:
 
 
 def _longest_wait_s(drives: Sequence[LiveDrive]) -> float | None:
-    """Return the longest time from the sending of a keyframe to its acknowledgement."""
+    """Return the longest time (s) from sending a keyframe to its acknowledgement; None without a keyframe."""
     waits = [
         float(keyframe["kept"]) - float(keyframe["sent"]) for drive in drives for keyframe in drive.keyframes
     ]

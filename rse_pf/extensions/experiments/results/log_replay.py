@@ -1,7 +1,7 @@
-"""Replay the log of a live map in a process of its own, and say what it holds.
+"""Replay the log of a live map in a child process, and return the keyframes and the digest of the map.
 
-The owners of maps compute with one thread of BLAS, so the replay does, too: with two threads the last bits of
-the poses may differ, and with them the digest.
+Map servers compute with one thread of BLAS, and so does the child process: with two threads the last bits of
+the poses, and thus the digest, may differ.
 """
 
 from __future__ import annotations
@@ -27,31 +27,40 @@ from rse_pf.storage.object_store import DirectoryStore
 
 __all__ = ["LoggedMap", "read_log", "run"]
 
+# Name of the demo's live map.
 _MAP_NAME = "demo"
+# Time after which a child process that has answered and does not exit is killed, in seconds.
 _END_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedMap:
-    """What the log of a map holds up to a position: its keyframes in order, and the digest of a replay."""
+    """The content of a map's log up to ``position``: keyframes in order, and the replayed map's digest.
+
+    ``epochs`` is the number of map servers that wrote entries.
+    """
 
     keyframes: tuple[tuple[str, int, float], ...]
-    """Name of the robot, number, and time stamp (seconds)."""
+    """Name of the robot, number, and time stamp (s) of each keyframe, in the order of the log."""
     epochs: int
     digest: str
     position: int
 
 
 class _WholeLog(LiveLog):
-    """A log that is read from its first entry."""
+    """A log that is read from its first entry, because it claims to have no snapshots."""
 
     def read_snapshots(self) -> Iterator[MapSnapshot]:
-        """Yield none."""
+        """Yield no snapshot."""
         return iter(())
 
 
 def read_log(objects: Path, position: int) -> LoggedMap:
-    """Replay the log of the map of the demo in *objects* up to *position*; raises UsageError."""
+    """Replay the log of the demo's live map in the object store *objects* up to entry *position*.
+
+    Raises:
+        UsageError: The log cannot be read, or the child process exited.
+    """
     child = start_child(ChildPlan(target=f"{__name__}:run", name="rse-pf replay"))
     child.say([str(objects), position])
     answer = receive(child.connection)
@@ -62,7 +71,10 @@ def read_log(objects: Path, position: int) -> LoggedMap:
 
 
 def run(parent: socket.socket) -> None:
-    """Replay the log that the *parent* names, and answer with what it holds, or why it cannot be replayed."""
+    """Replay the log whose store and position the *parent* sends, and answer with its content or the error.
+
+    This is the entry point of the child process.
+    """
     objects, position = receive(parent)
     try:
         answer: Any = asdict(_replay(Path(objects), position))

@@ -1,6 +1,6 @@
-"""The accuracy of a merged map: the trajectories of its robots in it, and their errors against the truth.
+"""The accuracy of a merged map: the trajectories of its robots, and their errors against the truth.
 
-The truth is used for errors alone; a report says which robots were left out of them.
+The truth is used for errors only; the report names the robots that are not in the map.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["JoinedRobot", "joined_robots", "merge_section", "merged_lines", "mer
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JoinedRobot:
-    """A robot in the merged map: its trajectory in its own world frame, and in that of the map."""
+    """A robot in the merged map: its trajectory in its own frame, in the map's frame, and the true one."""
 
     name: str
     own: Trajectory
@@ -42,7 +42,7 @@ def joined_robots(
     reply: MergeReply,
     merged: MapVersion,
 ) -> list[JoinedRobot]:
-    """Return the robots that were joined, with the pose of every frame in the merged map.
+    """Return the robots that are in the merged map, with the pose of every frame in that map.
 
     Args:
         names: Names of the robots, in the order in which their maps were sent.
@@ -70,16 +70,16 @@ def joined_robots(
 
 
 def move_frames(path: Trajectory, stamps_s: Array, T_before: Array, T_after: Array) -> Trajectory:
-    """Return *path* after its keyframes moved.
+    """Return *path* with its poses corrected as an optimisation has corrected its keyframes.
 
-    A frame between two keyframes gets their corrections interpolated by time; a frame outside gets that of
-    the nearest keyframe.
+    The correction of a frame between two keyframes is interpolated by time; a frame before the first or after
+    the last keyframe gets the correction of that keyframe.
 
     Args:
         path: ``n`` poses ``T_world_camera``, in the world frame of *T_before*.
         stamps_s: ``(k,)``, time stamps of the keyframes, ascending.
-        T_before: ``(k, 4, 4)``, poses of the keyframes before.
-        T_after: ``(k, 4, 4)``, poses of the keyframes after, in another world frame.
+        T_before: ``(k, 4, 4)``, poses of the keyframes before the optimisation.
+        T_after: ``(k, 4, 4)``, poses of the keyframes after it, in the world frame of the result.
     """
     corrections = T_after @ np.array([inverse(T) for T in T_before])
     after = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right"), 0, len(stamps_s) - 1)
@@ -100,12 +100,13 @@ def merge_section(
     merged: MapVersion,
     origin: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return ``merged`` of ``report.json``.
+    """Return the member ``merged`` of ``report.json``, the figures of a merged map.
 
-    ``ate_cm`` is over all frames of the joined robots after one rigid alignment to the truth.
-    ``ate_before_cm`` aligns every robot by itself, because before the merge their relative poses are unknown:
-    it holds their drift alone.  ``ate_stiff_cm`` moves every map rigidly to where the merge put it.
-    ``origins`` is the error of each robot's first pose relative to the first robot's.
+    ``ate_cm`` is the ATE of all frames of the joined robots after one rigid alignment of all robots to the
+    truth. ``ate_before_cm`` is that before the merge: since the relative poses of the robots are unknown
+    then, each robot is aligned by itself, so that only its drift counts.  ``ate_stiff_cm`` is that of the
+    maps moved rigidly to their poses in the merged map, without the optimisation.  ``origins`` is the error
+    of each robot's first pose relative to that of the first robot.
     """
     return {
         "joined": [names[row] for row in reply.joined],
@@ -127,7 +128,10 @@ def merge_section(
 
 
 def merged_lines(section: Mapping[str, Any]) -> str:
-    """Return the lines that the terminal shows of ``merged``; each ends with a newline."""
+    """Return the lines about a merged map for the terminal, each with a newline.
+
+    *section* is `merge_section`.
+    """
     joined = section["joined"]
     what = (
         f"{counted(section['links_between_robots'], 'link')} between them and "
@@ -159,7 +163,7 @@ def merged_lines(section: Mapping[str, Any]) -> str:
 
 
 def merged_table(section: Mapping[str, Any]) -> list[str]:
-    """Return the table of ``report.md`` about a merged map."""
+    """Return the lines of the Markdown table about a merged map; *section* is that of `merge_section`."""
     rejected: dict[str, list[str]] = defaultdict(list)
     for refusal in section["refused"]:
         first, other = refusal["robots"]
@@ -214,7 +218,10 @@ def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
 
 
 def _match_poses(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
-    """Return own, merged and true poses ``(n, 4, 4)`` of the frames whose truth is known."""
+    """Return the own, merged and true poses ``(n, 4, 4)`` of the frames that have a truth.
+
+    None if fewer than three frames have one.
+    """
     if robot.truth is None:
         return None
     try:
@@ -225,7 +232,11 @@ def _match_poses(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
 
 
 def _rigid_motion(own: Array, merged: Array) -> Array:
-    """Return the rigid motion that brings poses ``(n, 4, 4)`` closest: mean rotation, then translation."""
+    """Return the rigid motion ``(4, 4)`` that maps the poses *own* ``(n, 4, 4)`` closest to *merged*.
+
+    Its rotation is the mean of the relative rotations, and its translation the mean of the remaining
+    differences.
+    """
     U, _, Vt = np.linalg.svd((merged[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2)).sum(axis=0))
     T = np.eye(4)
     T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt

@@ -1,6 +1,6 @@
 """Parts of the Markdown reports that all experiments share: tables, numbers, and the description of a run.
 
-These functions format only; every figure comes from a report that can be computed again from its records.
+The functions format figures of a report; they compute none.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def page(*blocks: str | Sequence[str]) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
-    """Return the lines of a table."""
+    """Return the lines of a Markdown table with the column titles *head*."""
     return [
         "| " + " | ".join(head) + " |",
         "|" + "---|" * len(head),
@@ -26,28 +26,28 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
 
 
 def number(value: Any) -> str:
-    """Return *value* with at most six digits, "-" for None."""
+    """Return *value* as text: a float with at most six significant digits, and "-" for None."""
     return "-" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def three(percentiles: Mapping[str, Any]) -> str:
-    """Return p50, p95 and p99."""
+    """Return the text "p50 / p95 / p99" with the values of *percentiles*."""
     return " / ".join(number(percentiles.get(name)) for name in ("p50", "p95", "p99"))
 
 
 def slashed(values: Mapping[str, Any], *names: str) -> str:
-    """Return the values of *names* in one cell."""
+    """Return the values of *names* as one text, separated by " / "."""
     return " / ".join(number(values[name]) for name in names)
 
 
 def failures(report: Mapping[str, Any]) -> str:
-    """Return how many commands failed, and by which codes."""
+    """Return the number of failed commands as text, with the number for each error code in parentheses."""
     codes = ", ".join(f"{code} {count}" for code, count in report["failures_by_code"].items())
     return f"{report['commands']['failed']} ({codes})" if codes else str(report["commands"]["failed"])
 
 
 def about_run(report: Mapping[str, Any]) -> str:
-    """Return the paragraph on commit, load, machine, versions, settings and load generators of a run."""
+    """Return the paragraph on a run's commit, load average, machine, versions, settings and generators."""
     about = report["environment"]
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     generators = "".join(
@@ -65,6 +65,6 @@ def about_run(report: Mapping[str, Any]) -> str:
 
 
 def lost_line(report: Mapping[str, Any]) -> str:
-    """Return how many frames have no pose, lost ones and those before the start."""
+    """Return the text with the number of lost frames, and of those before a monocular robot's first pose."""
     before = report["frames_before_start"]
     return f"{report['lost_frames']} lost" + (f", {before} before the start" if before else "")

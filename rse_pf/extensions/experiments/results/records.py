@@ -1,8 +1,7 @@
-"""The raw records of a run: commands, events and samples of the monitor, written as they come and read back.
+"""The raw records of a run: commands, events and samples of the monitor, and the files that hold them.
 
 ``commands.csv`` has one line per command, ``events.jsonl`` one line per event, and ``samples.csv`` one line
-per server of each sample.  The first event, ``experiment``, holds the parameters of the run.  What is read
-back equals what was written; nothing here is computed.
+per server of each sample.  The first event, ``experiment``, holds the parameters of the run.
 """
 
 from __future__ import annotations
@@ -40,7 +39,10 @@ __all__ = [
     "write_commands",
 ]
 
-COMMANDS, EVENTS, SAMPLES = "commands.csv", "events.jsonl", "samples.csv"
+COMMANDS = "commands.csv"
+EVENTS = "events.jsonl"
+SAMPLES = "samples.csv"
+# Exceptions that a missing or malformed file of records raises.
 _MALFORMED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _HINT = "name the folder of a run"
 
@@ -50,10 +52,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandRecord:
-    """One command, by the clock of its robot (seconds since the start of the run).
+    """One command of a robot.
 
-    ``code`` is ``ok`` for a result, the code of a failure, or empty when no final answer came.
-    ``source`` is ``cloud`` or ``robot``.
+    ``planned``, ``sent`` and ``answered`` are seconds since the start of the run by the robot's clock.
+    ``code`` is ``ok`` for a result, the code of a failure, or empty if no final answer arrived.  ``source``
+    is ``cloud``, or ``robot`` if the robot computed the result itself.
     """
 
     id: int
@@ -74,7 +77,7 @@ class CommandRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Records:
-    """All records of a run, in the order of time."""
+    """All records of a run; events are in the order of time, commands and samples in that of their files."""
 
     commands: Sequence[CommandRecord]
     events: Sequence[Event]
@@ -87,7 +90,10 @@ _SERVER_COLUMNS = ["server", *(field.name for field in fields(ServerSample) if f
 
 
 class EventLog:
-    """Events as JSON lines, each flushed at once, so that the events of a killed run are kept."""
+    """Writer of events as JSON lines.
+
+    Each is flushed at once, so that the events of a killed run are kept.
+    """
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
@@ -98,17 +104,17 @@ class EventLog:
         self._file.flush()
 
     def copy(self, event: Event, time_s: float) -> None:
-        """Append an event of a platform or swarm, which has its name in the field ``event``."""
+        """Append *event* of a platform or swarm, named by its field ``event``, with the time *time_s*."""
         self.write(time_s, str(event["event"]), **event_details(event))
 
 
 def event_details(event: Event) -> dict[str, Any]:
-    """Return the fields of an event but for its name and time."""
+    """Return the fields of an event without its name and time."""
     return {name: value for name, value in event.items() if name not in ("event", "time", "action")}
 
 
 class SampleLog:
-    """Samples of the monitor as CSV lines, each flushed at once."""
+    """Writer of the monitor's samples as CSV lines; each sample is flushed at once."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
@@ -116,7 +122,10 @@ class SampleLog:
         self._writer.writerow(["time", "healthy_servers", *_SERVER_COLUMNS])
 
     def write(self, sample: MonitorSample) -> None:
-        """Append one sample; a sample without servers is one row whose server columns are empty."""
+        """Append a row for each server of *sample*.
+
+        Without servers, one row whose server columns are empty.
+        """
         head = [sample.time, sample.healthy_servers]
         for name, *values in (asdict(server).values() for server in sample.servers):
             self._writer.writerow([*head, name, *(_csv_value(value) for value in values)])
@@ -126,18 +135,18 @@ class SampleLog:
 
 
 def run_sample(time_s: float, healthy_servers: int, servers: Sequence[ServerSample] = ()) -> MonitorSample:
-    """Return a sample of *servers* at *time_s*, seconds since the start of the run."""
+    """Return a monitor sample of *servers* at *time_s* (s since the start of the run)."""
     return replace(monitor_sample(time_s, servers, frozenset()), healthy_servers=healthy_servers)
 
 
 def sample_from_document(document: Mapping[str, Any], origin_s: float) -> MonitorSample:
-    """Return a sample of the monitor, whose time is monotonic, with its time counted from *origin_s*."""
+    """Return the monitor sample in *document*, with its monotonic time counted from *origin_s*."""
     servers = msgspec.convert(document["servers"], tuple[ServerSample, ...])
     return run_sample(round(document["time"] - origin_s, 4), int(document["healthy_servers"]), servers)
 
 
 def write_commands(path: Path, commands: Iterable[CommandRecord]) -> None:
-    """Write ``commands.csv``."""
+    """Write *commands* to the CSV file *path*, with a header."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(_COMMAND_COLUMNS)
@@ -160,7 +169,10 @@ def read_records(folder: Path) -> Records:
 
 
 def parameters_of(records: Records) -> dict[str, Any]:
-    """Return the parameters of the run, which its first event holds; raises UsageError without one."""
+    """Return the details of the event ``experiment``, the parameters of the run.
+
+    Raises UsageError without it.
+    """
     for event in records.events:
         if event["action"] == "experiment":
             return event_details(event)
@@ -170,12 +182,12 @@ def parameters_of(records: Records) -> dict[str, Any]:
 
 
 def read_commands(path: Path) -> list[CommandRecord]:
-    """Return what `write_commands` wrote; raises UsageError."""
+    """Return the commands in a file of `write_commands`; raises UsageError if it is missing or malformed."""
     return _read(path, lambda rows: map(_command, rows))
 
 
 def read_samples(path: Path) -> list[MonitorSample]:
-    """Return what `SampleLog` wrote; raises UsageError."""
+    """Return the samples in a file of `SampleLog`; raises UsageError if it is missing or malformed."""
     return _read(path, _samples)
 
 
@@ -191,7 +203,10 @@ def _read_events(path: Path) -> list[Event]:
 
 
 def _read(path: Path, parse: Callable[[Iterable[Mapping[str, str]]], Iterable[T]]) -> list[T]:
-    """Return what *parse* makes of the rows of a CSV file, or of its compressed copy ``.gz`` beside it."""
+    """Return the values that *parse* yields for the rows of a CSV file.
+
+    If there is only a copy compressed by gzip, with the additional ending ``.gz``, that file is read.
+    """
     compressed = path.with_name(f"{path.name}.gz")
     try:
         with (

@@ -1,7 +1,8 @@
-"""The short form of an experiment, kept in its report: whether today's code still reaches its figures.
+"""The short run of an experiment: ``verify --rerun`` checks with it that the code still reaches its figures.
 
-A report says with which arguments a short run is made, which figures it must reach, and with how much slack,
-since a short run on another machine is not the same.  Nothing is run here.
+A report holds the plan of a short run: the arguments, the targets of its figures, and the tolerance of the
+targets, since a short run on another machine gives other figures.  This module makes and evaluates plans; it
+runs nothing.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from rse_pf.extensions.experiments.results.bars import Bars
 __all__ = ["RERUN", "FigureReached", "rerun_arguments", "rerun_figures", "rerun_plan"]
 
 RERUN = "rerun"
-"""Name of the plan in a report."""
+"""Member of a report that holds the plan."""
+# Tolerance: a "<=" target is multiplied by this factor for a short run, a ">=" target divided by it.
 _SLACK = 1.5
 _BAR = re.compile(r"(<=|>=) (-?\d+(\.\d+)?(e[-+]?\d+)?)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FigureReached:
-    """One figure of a short run, with what it must be and what the report says."""
+    """One figure of a short run, its target ``bar``, and the value ``reported`` for the full run."""
 
     name: str
     value: Any
@@ -33,7 +35,7 @@ class FigureReached:
     is_reached: bool
 
     def __str__(self) -> str:
-        """Return the line as it is printed."""
+        """Return the line that is printed: outcome, name, value, target and reported value."""
         outcome = "reached" if self.is_reached else "MISSED"
         return (
             f"{outcome:<7}  {self.name}  {self.value} now, must be {self.bar}; {self.reported} in the report"
@@ -41,13 +43,16 @@ class FigureReached:
 
 
 def rerun_plan(arguments: Sequence[str], bars: Bars) -> dict[str, Any]:
-    """Return the plan for a report: arguments of ``rse-pf experiment KIND``, and bars of figures."""
+    """Return the plan for a report: arguments of ``rse-pf experiment KIND``, tolerance and targets."""
     bar_texts = {name: f"{sense} {bar:g}" for name, (bar, sense) in bars.items()}
     return {"arguments": list(arguments), "slack": _SLACK, "bars": bar_texts}
 
 
 def rerun_arguments(report: Mapping[str, Any]) -> list[str]:
-    """Return kind and arguments of the short run; raises UsageError for a report without a plan."""
+    """Return the arguments of ``rse-pf experiment`` for the short run of *report*.
+
+    Raises UsageError without a plan.
+    """
     plan = report.get(RERUN)
     arguments = plan.get("arguments") if isinstance(plan, dict) else None
     if not isinstance(arguments, list) or not all(isinstance(word, str) for word in arguments):
@@ -56,10 +61,13 @@ def rerun_arguments(report: Mapping[str, Any]) -> list[str]:
 
 
 def rerun_figures(report: Mapping[str, Any], short: Mapping[str, Any]) -> list[FigureReached]:
-    """Return for each bar of *report* whether the report of the short run reaches it; raises UsageError.
+    """Return for each target in the plan of *report* whether the report *short* of the short run meets it.
 
-    A figure is named by its path, within ``runs`` if the report has several; of a list, one value for each
-    robot, the largest counts.  A figure that is missing is not reached.
+    A target names its figure by a path, below ``runs`` if the report has several runs.  Of a figure that is a
+    list with a value for each robot, the largest value counts.  A missing figure does not meet its target.
+
+    Raises:
+        UsageError: The plan is malformed.
     """
     plan = report[RERUN]
     try:
@@ -88,7 +96,7 @@ def _check_bar(name: str, sense: str, limit: float, *, value: Any, reported: Any
 
 
 def _at(report: Mapping[str, Any], name: str) -> float | None:
-    """Return the figure at the path *name*; None if there is none."""
+    """Return the number at the path *name* in *report*, or the largest of a list; None if there is none."""
     value: Any = report.get("runs", report)
     for step in name.split("/"):
         value = value.get(step) if isinstance(value, Mapping) else None

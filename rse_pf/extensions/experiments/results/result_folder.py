@@ -1,6 +1,6 @@
-"""The folder that a run writes its results to, and the description of machine, versions and settings in it.
+"""The folder of results of a run, and the description of machine, versions and settings in its report.
 
-A folder that holds other files than those of an earlier run is refused, and nothing is removed from it.
+A folder that holds other files than those of an earlier run is an error, and nothing is removed from it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,11 @@ __all__ = [
 ]
 
 RUN_FILES = ("report.json", "report.md", COMMANDS, EVENTS, SAMPLES, "platform")
-"""What every experiment and the demo write."""
+"""Names of the files and the folder that every experiment and the demo write."""
 _CHECKOUT = Path(__file__).resolve().parents[4]
+# Time limit of ``git describe``, in seconds.
 _GIT_S = 10.0
+# Packages whose versions the report states.
 _PACKAGES = (
     "rse-pf",
     "numpy",
@@ -54,8 +56,9 @@ def fresh_folder(folder: Path, written: Sequence[str]) -> Path:
         written: Names of all files and folders that this kind of run writes; they may be patterns.
 
     Raises:
-        UsageError: It is a file, holds other files, holds no events of a run, or cannot be written; nothing
-            was removed.
+        UsageError: *folder* is a file, holds other files, holds no events of a run, or cannot be written.
+            Other
+            files are never removed.
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", hint="name a folder with --out")
@@ -83,7 +86,11 @@ def finish_report(
     settings: PlatformSettings,
     load_before: list[float],
 ) -> str:
-    """Write ``report.json`` with the machine, versions and load, and ``report.md``; return its text."""
+    """Write ``report.json`` and ``report.md`` to *folder*, and return the text of ``report.md``.
+
+    The environment of the run is added to *report*: machine, versions, settings and load average.  *page*
+    formats the complete report as Markdown; *load_before* is the load average before the run.
+    """
     about = environment(settings)
     about["load_average"] = load_before
     about["load_average_after"] = load_average()
@@ -95,7 +102,7 @@ def finish_report(
 
 
 def environment(settings: PlatformSettings) -> dict[str, Any]:
-    """Return what a reader needs to compare two runs: commit, machine, versions, load and settings."""
+    """Return commit, Python, system, cores, load average, digest of *settings* and versions, for a report."""
     versions = {}
     for name in _PACKAGES:
         try:
@@ -114,7 +121,10 @@ def environment(settings: PlatformSettings) -> dict[str, Any]:
 
 
 def commit_of(checkout: Path) -> str:
-    """Return the commit of *checkout*, with ``+changes`` if its files differ; empty if it is no checkout."""
+    """Return the commit hash of *checkout*, with ``+changes`` if tracked files are modified.
+
+    The text is empty if *checkout* is no Git working tree, or Git fails.
+    """
     if not (checkout / ".git").exists():
         return ""
     command = ["git", "-C", str(checkout), "describe", "--always", "--exclude=*", "--abbrev=40"]
@@ -138,7 +148,7 @@ def write_json(path: Path, report: Mapping[str, Any]) -> None:
 
 
 def remove_keys(platform_folder: Path) -> None:
-    """Delete the keys of a platform that has ended, and of its live maps: results never hold a secret."""
+    """Delete the signing keys of a stopped platform and of its live maps, so that results hold no secret."""
     for pattern in ("key*.json", "objects/live/key=*"):
         for file in platform_folder.glob(pattern):
             file.unlink()

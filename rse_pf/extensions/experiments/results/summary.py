@@ -1,8 +1,9 @@
-"""Figures that every report holds: counts of commands, percentiles, and the means that the paper gives.
+"""Figures that every report holds: counts of commands, percentiles, and the means that the paper states.
 
-Pure functions over `rse_pf.extensions.experiments.results.records`.  An outage is the time around a fault for
-which a robot had no answer; only robots whose last answer before the fault came from the affected server
-count, also those that got no further answer until the end of the run."""
+The functions compute figures from `rse_pf.extensions.experiments.results.records` only.  An outage is the
+time around a fault in which a robot received no answer.  A fault of a server affects the robots whose last
+answer before the fault came from that server; a robot that received no further answer counts as well.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +29,17 @@ __all__ = [
 ]
 
 PAPER = {"round_trip_ms": 156.36, "compute_ms": 29.82, "payload_bytes": 10_000, "fps_per_robot": 5.0}
-"""The paper's Sect. 6.1 and 6.2: means over a hundred robots, Shenzhen to Seoul."""
+"""Means in the paper's Sect. 6.1 and 6.2, over a hundred robots between Shenzhen and Seoul."""
 ROUND_TRIP_PARTS = ("up_ms", "queue_ms", "compute_ms", "down_ms")
-"""Parts of a round trip; the rest is spent in the robot itself (and in a late load generator)."""
+"""Parts of a round trip outside the robot; the rest is the time in the robot and the lateness of the load
+generator."""
 
 
 def summarise(commands: Sequence[CommandRecord]) -> dict[str, Any]:
-    """Return counts and percentiles of a run.
+    """Return the counts of commands, and percentiles of round trips and their parts.
 
-    *Answered* means a result from the cloud or the robot; *lost* means no final answer at all;
-    *twice* counts commands with more than one final answer.
+    ``answered`` counts results of the cloud or of the robot itself, ``lost`` commands without a final answer,
+    ``twice`` commands with more than one, and ``answered_by_robot`` results of the robot itself.
     """
     finals = Counter((command.robot, command.id) for command in commands if command.code)
     failures = Counter(command.code for command in commands if command.code not in ("", "ok"))
@@ -62,9 +64,9 @@ def summarise(commands: Sequence[CommandRecord]) -> dict[str, Any]:
 
 
 def summary_of(records: Records) -> dict[str, Any]:
-    """Return `summarise` of the commands, with duplicates and wrong poses as the load generator counted them.
+    """Return `summarise` of the commands, with the load generator's counts of duplicates and wrong poses.
 
-    A duplicate answer has no row of its own; the generator counts those that reached a caller.
+    A duplicate answer has no row in the records; the load generator counts those that reached the caller.
     """
     summary = summarise(records.commands)
     generator = [event for event in records.events if event["action"] == "generator"]
@@ -75,7 +77,10 @@ def summary_of(records: Records) -> dict[str, Any]:
 
 
 def percent_answered(commands: Sequence[CommandRecord], within_ms: float | None = None) -> float | None:
-    """Return the share of commands with a result (at most *within_ms* after the plan); None without any."""
+    """Return the percentage of commands that have a result; None if there are no commands.
+
+    With *within_ms* only results whose round trip is at most that long count.
+    """
     if not commands:
         return None
     good = {
@@ -88,7 +93,10 @@ def percent_answered(commands: Sequence[CommandRecord], within_ms: float | None 
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float | int | None]:
-    """Return n, mean, p50, p95, p99 and the maximum, rounded to three digits."""
+    """Return n, mean, p50, p95, p99 and maximum of *values*, rounded to three decimals.
+
+    None without values.
+    """
     if not values:
         return {"n": 0, "mean": None, "p50": None, "p95": None, "p99": None, "max": None}
     p50, p95, p99, largest = np.percentile(values, [50, 95, 99, 100])
@@ -112,16 +120,17 @@ def longest_outages(
     start_s: float,
     end_s: float,
 ) -> dict[str, float]:
-    """Return the longest time between two answers of each robot that overlaps ``[start_s, end_s]``.
+    """Return for each robot the longest time (s) between two answers that overlaps ``[start_s, end_s]``.
 
-    In seconds.  For a robot that sent commands after its last answer, the outage ends with its last
-    command; for a robot that stopped sending there is none.
+    If a robot sent commands after its last answer, the time from that answer to its last command counts as
+    well.
 
     Args:
         commands: All commands of the run.
-        robots: The robots to look at.
+        robots: Names of the robots for which the time is returned.
         start_s: Time of the fault, seconds since the start of the run.
-        end_s: When its consequences must be over.
+        end_s: End of the time in which outages are attributed to the fault, seconds since the start of the
+            run.
     """
     times: dict[str, list[float]] = defaultdict(list)
     planned: dict[str, float] = defaultdict(float)
@@ -151,7 +160,7 @@ def longest_outages(
 def outage_figures(
     commands: Sequence[CommandRecord], robots: Collection[str], *, start_s: float, end_s: float
 ) -> dict[str, Any]:
-    """Return how many robots were affected, and p50, p99 and maximum of their outages in seconds."""
+    """Return the number of *robots*, and p50, p99 and maximum of their `longest_outages` in seconds."""
     outages = longest_outages(commands, robots, start_s=start_s, end_s=end_s)
     figures = percentiles(list(outages.values()))
     return {"robots": len(outages), "p50": figures["p50"], "p99": figures["p99"], "max": figures["max"]}

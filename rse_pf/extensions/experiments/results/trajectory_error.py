@@ -1,7 +1,7 @@
 """Errors of an estimated trajectory against the true one: ATE and RPE as the TUM benchmark defines them.
 
-The truth is interpolated to the time stamps of the estimate.
-Pure functions: they change neither trajectory and read no files.
+The truth is interpolated to the time stamps of the estimate.  The functions change neither trajectory and
+read no files.
 """
 
 from __future__ import annotations
@@ -28,21 +28,22 @@ __all__ = [
 ]
 
 MAX_TRUTH_GAP_S = 0.25
-"""A pose between two true ones that are further apart has no truth."""
+"""The truth is not interpolated between two true poses that are more than this many seconds apart."""
 SAME_STAMP_S = 0.002
-"""A pose this close to a true one in time has it as its truth, also before the first and after the last."""
+"""A pose within this many seconds of a true one has a truth, also before the first and after the last."""
 STEP_S = 1.0
-"""The motion of the relative error."""
+"""Time over which the relative pose error compares motions, in seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """Errors of a trajectory whose poses all have a truth, after one alignment of the whole.
+    """Errors of the poses that have a truth, after one alignment of the whole trajectory.
 
-    ``rpe_m`` and ``rpe_deg`` are of the motion over `STEP_S`, None if no two poses are that far apart; they
-    are in metres also where the scale was estimated.  ``compared`` are the estimated poses before the
-    alignment, ``aligned`` after it, ``truth`` the true ones of the same times; ``has_unit`` says whether
-    ``compared`` is in metres, so that no scale is left to be estimated.
+    ``rpe_m`` and ``rpe_deg`` are the errors of the motion over `STEP_S`, None if no two poses are that far
+    apart in time; they are in metres also if the scale was estimated.  ``poses`` is the number of poses that
+    were compared. ``compared`` holds the estimated poses before the alignment, ``aligned`` those after it,
+    and ``truth`` the true poses at the same times.  ``has_unit`` says whether ``compared`` is in metres
+    already, so that its scale need not be estimated.
     """
 
     ate_m: float
@@ -65,14 +66,16 @@ def accuracy(
     with_scale: bool = False,
     T_body_camera: Array | None = None,
 ) -> Accuracy:
-    """Return the errors of an estimate against a truth that is interpolated to its time stamps.
+    """Return the errors of *estimate* against *truth*, interpolated to the time stamps of *estimate*.
 
     Args:
         estimate: Poses of a camera; those without truth are left out.
-        truth: True poses of the same camera, in any frame.
-        with_scale: Estimate a scale (Sim(3)), as where the estimate's unit is unknown; else SE(3).
-        T_body_camera: ``(4, 4)``, metres; both are compared as poses of the body.  With a scale, that of the
-            camera's path is applied before, since the body's place beside the camera is in metres.
+        truth: True poses of the same camera, in any world frame.
+        with_scale: Align with a scale (Sim(3)), for an estimate whose unit is unknown; otherwise without
+            (SE(3)).
+        T_body_camera: ``(4, 4)``, metres.  If given, both trajectories are compared as poses of the body.
+            With
+            *with_scale* the camera's path is scaled to metres first, since the body's offset is in metres.
 
     Raises:
         UsageError: Fewer than three poses have a truth.
@@ -109,7 +112,7 @@ def accuracy(
 
 
 def match_truth(estimate: Trajectory, truth: Trajectory) -> tuple[npt.NDArray[np.int64], Array]:
-    """Return the rows ``(n,)`` of the estimate that have a truth, and the true poses ``(n, 4, 4)`` of these.
+    """Return the rows ``(n,)`` of *estimate* that have a truth, and their true poses ``(n, 4, 4)``.
 
     Raises:
         UsageError: Fewer than three poses have a truth.
@@ -124,7 +127,11 @@ def match_truth(estimate: Trajectory, truth: Trajectory) -> tuple[npt.NDArray[np
 
 
 def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Return which of the ``(n,)`` times have a truth: true poses on both sides, or one at the same time."""
+    """Return for each of the times ``(n,)`` whether it has a truth.
+
+    It has one between two true poses at most `MAX_TRUTH_GAP_S` apart, or within `SAME_STAMP_S` of a true
+    pose.
+    """
     stamps, known = np.asarray(stamps_s, dtype=float), np.sort(truth.timestamps_s)
     if not len(known):
         return np.zeros(len(stamps), dtype=bool)
@@ -136,7 +143,10 @@ def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.boo
 
 
 def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:
-    """Return the errors of the motion from each pose to that `STEP_S` later, in metres and degrees."""
+    """Return the errors (metres, degrees) of the motion from each pose to the pose `STEP_S` later.
+
+    Poses without another one at that time, within half the median interval, have no error in the arrays.
+    """
     errors = []
     half_s = 0.5 * float(np.median(np.diff(stamps_s)))
     for row, stamp_s in enumerate(stamps_s):
@@ -148,7 +158,7 @@ def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Arr
 
 
 def ate_m(T_estimate: Array, T_truth: Array) -> float:
-    """Return the rmse of the positions of ``(n, 4, 4)`` poses after the best SE(3) alignment."""
+    """Return the rmse (m) of the positions of poses ``(n, 4, 4)`` after the least-squares SE(3) alignment."""
     positions, wanted = T_estimate[:, :3, 3], T_truth[:, :3, 3]
     _, T_truth_estimate = align(positions, wanted)
     moved = positions @ T_truth_estimate[:3, :3].T + T_truth_estimate[:3, 3]
@@ -158,10 +168,10 @@ def ate_m(T_estimate: Array, T_truth: Array) -> float:
 def trajectory_figures(
     estimate: Trajectory, truth: Trajectory | None, T_body_camera: Array | None = None
 ) -> dict[str, float | None]:
-    """Return ``path_m``, and ``ate_cm``, ``rpe_cm`` and ``rpe_deg`` of `accuracy`, rounded for a report.
+    """Return the length ``path_m`` of *estimate*, and its ``ate_cm``, ``rpe_cm`` and ``rpe_deg``, rounded.
 
-    The errors are None without a truth, or where fewer than three poses have one.  With *T_body_camera*
-    ``(4, 4)`` they are those of the body.
+    The errors are None without a truth, or if fewer than three poses have one.  With *T_body_camera* ``(4,
+    4)`` they are errors of the body.
     """
     figures: dict[str, float | None] = {
         "path_m": round(estimate.length_m, 3),
@@ -180,7 +190,9 @@ def trajectory_figures(
 
 
 def align(points: Array, wanted: Array, *, with_scale: bool = False) -> tuple[float, Array]:
-    """Return scale and pose that bring ``(n, 3)`` points closest to *wanted*: ``s R p + t``.
+    """Return scale ``s`` and pose ``[R t]`` with which ``s R p + t`` maps *points* closest to *wanted*.
+
+    Both are ``(n, 3)``, and the sum of squared distances is minimal.  The scale is 1 without *with_scale*.
 
     Source:
         Umeyama, PAMI 1991, eqs. 38-42.
