@@ -1,8 +1,9 @@
-"""A robot of ROS as a robot of the platform: images of topics in, poses, paths and clouds as topics out.
+"""The bridge that makes a ROS robot a robot of the platform.
 
-`options`, `incoming`, `outgoing` and `bridge` need no ROS: they take and give the bytes of messages.  The
-shells `ros1_node` (rospy) and `ros2_node` (rclpy) carry those bytes.
-Nothing of the platform imports this package.
+It receives the images of topics and publishes poses, paths, transforms and clouds as topics.  The modules
+`options`, `incoming`, `outgoing` and `bridge` need no ROS: they receive and return the bytes of messages.
+The shells `ros1_node` (rospy) and `ros2_node` (rclpy) transport these bytes.  No package of the platform
+imports this one.
 """
 
 from ros_bridge.bridge import Bridge, Publish

@@ -14,7 +14,7 @@ from rse_pf.terminal import show, show_error
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line with a hint, instead of a page."""
+    """An argument parser that reports a wrong argument as one line with a hint, without the usage text."""
 
     def error(self, message: str) -> NoReturn:
         show_error(UsageError(f"{self.prog}: {message}", hint=f"see {self.prog} --help"))
@@ -22,7 +22,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the bridge that the command line names; return the exit code."""
+    """Run the shell that *arguments* name (None: those of the process); return the exit code."""
     parser = _Parser(
         prog="rse-pf-ros",
         description="Bridge a robot of ROS to the platform: images in; poses, paths, transforms, clouds out.",
@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
     except RsePfError as error:
         show_error(error)
         return 1
-    except KeyboardInterrupt:  # Ctrl-C before the bridge runs; then it ends by itself, with 0
+    except KeyboardInterrupt:  # Ctrl-C before the bridge runs; a running bridge handles it and returns 0
         return 130
 
 

@@ -1,4 +1,4 @@
-"""How a bridge reaches the platform: by its address and a file with a token, or by an enrolment."""
+"""The connection of a bridge to the platform: by address and a file with a token, or by an enrolment."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ __all__ = ["connect_robot", "data_client"]
 
 
 def data_client(options: BridgeOptions) -> DataClient:
-    """Return a client of the data service; raises UsageError for a token or enrolment that cannot be read."""
+    """Return a client of the data service; raises UsageError if the file of the enrolment cannot be read."""
     if options.enrolment:
         return DataClient.enrolled(options.enrolment)
     return DataClient(options.url, lambda: _read_token(Path(options.token_file)))
 
 
 def connect_robot(options: BridgeOptions) -> Robot:
-    """Return the robot that the options name, not connected yet; raises UsageError if they name none."""
+    """Return the robot with the token or enrolment in *options*, not connected yet.
+
+    Raises:
+        UsageError: The options name neither address and token nor an enrolment, or the file cannot be read.
+    """
     if options.enrolment:
         return connect(enrolment=options.enrolment, on_change=_log_change)
     if not (options.url and options.token_file):
@@ -30,7 +34,7 @@ def connect_robot(options: BridgeOptions) -> Robot:
             hint="rse-pf local prints the address; rse-pf token issue ROBOT issues a token",
         )
     file = Path(options.token_file)
-    _read_token(file)  # a file that cannot be read is told at once, not after several attempts
+    _read_token(file)  # raises the error of an unreadable file now, not after several attempts to connect
 
     async def token() -> str:
         return _read_token(file)
@@ -39,7 +43,7 @@ def connect_robot(options: BridgeOptions) -> Robot:
 
 
 def _read_token(file: Path) -> str:
-    """Return the token in a file; an error names the file and the cause, and nothing of what is in it."""
+    """Return the token in *file*; raises UsageError, which names file and cause, but none of the content."""
     try:
         token = file.read_text(encoding="ascii").strip()
         cause = "" if token else "it is empty"
@@ -56,7 +60,7 @@ def _read_token(file: Path) -> str:
 
 
 def _log_change(what: str, why: str) -> None:
-    """Say when the connection is lost and why, and when it is back."""
+    """Print that the connection was lost, with the reason, or restored, with the name of the server."""
     if what == "link-lost":
         show(f"connection lost: {why}")
     elif what == "link-back":

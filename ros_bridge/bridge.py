@@ -1,6 +1,7 @@
-"""The bridge itself: frames into a mapper, its answers out as messages; without ROS.
+"""The bridge without ROS: it tracks received frames with a mapper, and publishes the poses as messages.
 
-A shell gives it the bytes of messages by `Bridge.receive`, from any thread, and a function that publishes.
+A shell passes the bytes of received messages to `Bridge.receive`, from any thread, and gives the bridge a
+function that publishes messages.
 """
 
 from __future__ import annotations
@@ -37,17 +38,22 @@ __all__ = ["Bridge", "CallReply", "Publish", "connected_bridge"]
 Publish = Callable[[Message], None]
 """Publishes a message; called from the bridge's event loop, so it must not wait."""
 
+# Time between two status messages, in seconds.
 _DIAGNOSTICS_EVERY_S = 1.0
+# Time between two messages with the path, in seconds.
 _PATH_EVERY_S = 0.5
+# Smallest number of measurements of a point that is published in the cloud of a robot's own map.
 _LEAST_READINGS = 2
+# Deadline of a call of the platform through the ROS service ``call``, in seconds.
 _CALL_S = 10.0
-_CLOCK_RESTART_S = 1.0  # a stamp that is earlier by more was not mixed up: the source began anew
+# A frame that is earlier than the last one by more than this, in seconds, comes from a restarted source.
+_CLOCK_RESTART_S = 1.0
 _IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True, slots=True)
 class CallReply:
-    """The answer to a service of ROS: the reply as JSON, or the code and the message of an error."""
+    """The result of a ROS service: ``reply`` as JSON if ``ok``, else ``code`` and ``message`` of an error."""
 
     ok: bool
     reply: str = ""
@@ -56,7 +62,7 @@ class CallReply:
 
 
 class Bridge:
-    """One robot; `run` it, `receive` messages from any thread."""
+    """The bridge of one robot: `run` tracks and publishes, `receive` may be called from any thread."""
 
     def __init__(
         self,
@@ -71,12 +77,12 @@ class Bridge:
         """Describe a bridge.
 
         Args:
-            mapper: Of a connected robot.
-            options: What is bridged.
-            publish: Gets each message.
-            is_ros1: Whether messages are in the format of ROS 1, or in CDR.
-            robot: For services of ROS that call the platform; None refuses them.
-            clock: Seconds, monotonic; for pauses between clouds, paths and diagnostics.
+            mapper: The mapper of a connected robot.
+            options: The options of the bridge.
+            publish: Called with each message to publish.
+            is_ros1: Whether messages are encoded as in ROS 1; otherwise as CDR, as in ROS 2.
+            robot: The robot with which ROS services call the platform; None lets those services fail.
+            clock: Returns seconds, monotonic; for the intervals between clouds and paths.
         """
         maker = MessageMaker(is_ros1=is_ros1)
         self.frames = 0
@@ -95,16 +101,16 @@ class Bridge:
         self._cloud: asyncio.Task[None] | None = None
         self._maps = None if robot is None else MapServices(robot, mapper, options)
         self._seen: Camera | None = None
-        self._tells_imu = bool(options.imu) and options.publish_odom
+        self._publishes_imu = bool(options.imu) and options.publish_odom
 
     def close(self) -> None:
-        """End what the services of maps have opened."""
+        """Close the connection to the data service, if a service of maps has opened one."""
         if self._maps is not None:
             self._maps.close()
 
     @property
     def triggers(self) -> dict[str, Callable[[], Coroutine[Any, Any, CallReply]]]:
-        """The services of ROS without a request (``std_srvs/Trigger``), by name."""
+        """The functions of the ROS services without a request (``std_srvs/Trigger``), by service name."""
         return {
             "save": self.save,
             "publish": lambda: self._of_maps(MapServices.publish),
@@ -113,16 +119,16 @@ class Bridge:
         }
 
     def receive(self, role: Role, data: bytes | memoryview) -> None:
-        """Take the bytes of a message of a topic; quick, never waits, raises nothing."""
+        """Store the bytes of a message of the topic *role*; never waits and raises no error."""
         if self._incoming.add(role, data):
-            with contextlib.suppress(RuntimeError):  # the loop has ended: so has the bridge
+            with contextlib.suppress(RuntimeError):  # the event loop is closed: the bridge has stopped
                 self._loop.call_soon_threadsafe(self._has_frame.set)
 
     async def run(self) -> None:
-        """Track frames and publish, until cancelled.
+        """Track frames and publish the results, until cancelled.
 
         Raises:
-            RsePfError: The robot has stopped reconnecting: its token has expired, or another has its name.
+            RsePfError: The robot has stopped reconnecting: its token expired, or another robot uses its name.
         """
         running = [asyncio.create_task(self._take()), asyncio.create_task(self._report())]
         try:
@@ -136,7 +142,10 @@ class Bridge:
             await asyncio.gather(*ending, return_exceptions=True)
 
     async def save(self) -> CallReply:
-        """Write map and trajectory into the folder of the options."""
+        """Write map and trajectory to the folder ``out`` of the options.
+
+        Return the mapper's report as JSON.
+        """
         if not self._options.out:
             return CallReply(ok=False, code="usage", message="no folder: set the parameter out")
         try:
@@ -146,7 +155,7 @@ class Bridge:
         return CallReply(ok=True, reply=json.dumps(report))
 
     async def call(self, service: str, payload: str) -> CallReply:
-        """Call a service of the platform with a payload in JSON."""
+        """Call the platform's service *service* with the JSON *payload*; return its reply as JSON."""
         if self._robot is None:
             return CallReply(ok=False, code="disconnected", message="this bridge has no connection")
         try:
@@ -169,7 +178,7 @@ class Bridge:
             return CallReply(ok=False, code=error.code, message=said)
 
     async def _take(self) -> None:
-        """Track each frame that comes."""
+        """Track and publish each received frame, until cancelled."""
         while True:
             await self._has_frame.wait()
             self._has_frame.clear()
@@ -197,7 +206,7 @@ class Bridge:
             tracked, images.stamp_ns, images.camera_frame, T_map_odom=T_map_odom, alignment=alignment
         ):
             self._publish(message)
-        self._tell_imu(images)
+        self._publish_imu_pose(images)
         now = self._clock()
         if now >= self._due["path"]:
             self._due["path"] = now + _PATH_EVERY_S
@@ -207,12 +216,12 @@ class Bridge:
             self._due["cloud"] = now + self._options.cloud_every_s
             self._cloud = asyncio.create_task(self._publish_cloud(images.stamp_ns))
 
-    def _tell_imu(self, images: PairedImages) -> None:
-        """Publish once where the IMU is; its frame is named by its samples."""
+    def _publish_imu_pose(self, images: PairedImages) -> None:
+        """Publish the IMU's pose in the camera frame once, when it and the name of the IMU's frame are known."""
         rig = self._incoming.rig
         T = rig.T_camera_imu
-        if self._tells_imu and rig.imu_frame and T is not None:
-            self._tells_imu = False
+        if self._publishes_imu and rig.imu_frame and T is not None:
+            self._publishes_imu = False
             self._publish(self._outgoing.imu_place(images.stamp_ns, images.camera_frame, rig.imu_frame, T))
 
     async def _track(self, frame: Frame) -> TrackedFrame:
@@ -225,7 +234,10 @@ class Bridge:
         return tracked
 
     def _alignment(self) -> tuple[Array | None, Array | None]:
-        """Return where the odometry frame is in the map; a map of its own begins where the robot did."""
+        """Return the pose ``(4, 4)`` of the odometry frame in the map and its covariance ``(6, 6)``.
+
+        Both may be None with a live map.  A robot with a map of its own has the identity and None.
+        """
         if isinstance(self._mapper, LiveMapper):
             return self._mapper.T_map_odom, self._mapper.covariance
         return _IDENTITY, None
@@ -240,12 +252,12 @@ class Bridge:
             self._publish(message)
 
     async def _report(self) -> None:
-        """Publish how the bridge is, each second, whether frames come or not."""
+        """Publish the status of the bridge each second, also if no frames arrive, until cancelled."""
         last, received, logged, check = 0, Counter[str](), "", self._incoming.check
         while True:
             connected = self._robot is None or self._robot.connected
             cause = "" if self._robot is None or connected else self._robot.stats.last_error
-            if cause and cause != logged and not cause.startswith("connection lost"):  # told already
+            if cause and cause != logged and not cause.startswith("connection lost"):  # is printed elsewhere
                 show(f"no connection to the platform: {cause}")
             logged = cause
             values = {
@@ -276,7 +288,10 @@ class Bridge:
             await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
 
     def _silence(self, before: Counter[str], frames_before: int) -> str:
-        """Return which topics of images sent nothing since *before*; empty if there was a frame."""
+        """Return a sentence with the image topics that sent no message since the counts *before*.
+
+        Empty if each sent one, or if a frame was tracked since.
+        """
         if self.frames != frames_before:
             return ""
         partner = self._options.partner
@@ -294,11 +309,13 @@ class Bridge:
 async def connected_bridge(
     options: BridgeOptions, publish: Publish, *, is_ros1: bool
 ) -> AsyncIterator[Bridge]:
-    """Connect to the platform that the options name, join its live map if they name one, give a bridge.
+    """Connect to the platform, join the live map if *options* name one, and yield a bridge.
+
+    Close all afterwards.
 
     Raises:
-        UsageError: There is no address, or no token that can be read.
-        RsePfError: The platform refuses the robot.
+        UsageError: The options have no address, or the token cannot be read.
+        RsePfError: The platform rejected the robot.
     """
     async with connect_robot(options) as robot, contextlib.AsyncExitStack() as stack:
         mapper: Mapper | LiveMapper

@@ -1,7 +1,8 @@
-"""From the bytes of image messages to frames: paired by their time stamps, undistorted, with depth in metres.
+"""Turn the bytes of image messages into frames: paired by time stamp, undistorted, with depth in metres.
 
-It never waits and never grows: what does not fit is counted in `IncomingFrames.check`.  The time of a
-frame is the stamp that the camera's driver gave, never the time of arrival.
+Queues are bounded, and adding a message never waits: images that do not fit are counted in
+`IncomingFrames.check`. The time of a frame is the time stamp that the driver of the camera set, never the
+time of arrival.
 """
 
 from __future__ import annotations
@@ -32,19 +33,25 @@ from rse_pf.geometry import Camera, Lens
 __all__ = ["IncomingFrames", "PairedImages", "Role", "kind_of"]
 
 Role = Literal["colour", "depth", "right", "info", "right_info", "imu"]
+# Exceptions that decoding of a malformed message may raise.
 _FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+# A time stamp this far before the last frame, in ns, means that the clock was set back or a bag plays again.
 _JUMP_NS = 1_000_000_000
-"""A stamp that lies so far back is of a clock that was set, or of a bag that is played again."""
 _INFOS: tuple[Role, ...] = ("info", "right_info")
-_MAX_CAMERAS = 10  # camera_infos: images that wait are older than the last few changes of a lens at most
+# Number of camera_infos with different lenses that are stored: images that wait are not older than these.
+_MAX_CAMERAS = 10
 _REPEATED = "repeated"
+# The partner of a colour image as text for the user, by role.
 _NAMES = {"depth": "depth", "right": "right image"}
+# Largest number of images of a topic that wait for their partner.
 _WAITING = 30
-"""So many images of a topic wait for their partner."""
 
 
 def kind_of(role: Role, topic: str) -> str:
-    """Return the type of a topic, as ROS 2 names it: by its role, and by the end of its name."""
+    """Return the ROS 2 name of the message type of *topic*, by its *role* and the end of its name.
+
+    Images are compressed if the name ends with ``compressed`` or ``compressedDepth``.
+    """
     if role == "imu":
         return IMU
     if role in ("info", "right_info"):
@@ -53,7 +60,7 @@ def kind_of(role: Role, topic: str) -> str:
 
 
 def _cause(error: Exception) -> str:
-    """Return an error in one line; hints are those of bags."""
+    """Return the message of *error* without its hint, since hints are about bags."""
     return error.message if isinstance(error, RsePfError) else str(error)
 
 
@@ -63,12 +70,16 @@ def _stamp_ns(message: Any) -> int:
 
 
 class _RepeatedImage(BrokenMessage):
-    """An image has the bytes of the image before it."""
+    """An image has the same bytes as the previous image of its topic."""
 
 
 @dataclass(frozen=True, slots=True)
 class _StatedCamera:
-    """A camera_info from its stamp on: its lens, the first camera, the map between both, and what changed."""
+    """A camera_info that is valid from ``stamp_ns`` on.
+
+    ``rectified`` is the pinhole camera of the first camera_info, to which ``rectifier`` maps images of
+    ``lens``; ``change`` says how the lens differs from the first one, and is empty if it does not.
+    """
 
     stamp_ns: int
     lens: Lens
@@ -78,7 +89,11 @@ class _StatedCamera:
 
 
 def _change_of(topic: str, first: Lens, lens: Lens) -> str:
-    """Return which numbers of a camera_info changed; raises BrokenMessage if the images have another size."""
+    """Return a sentence with the numbers of a camera_info that changed from *first* to *lens*.
+
+    Raises:
+        BrokenMessage: The size of the images changed.
+    """
     pairs = {
         name: (getattr(first.camera, name), getattr(lens.camera, name))
         for name in ("width", "height", "fx", "fy", "cx", "cy")
@@ -93,9 +108,10 @@ def _change_of(topic: str, first: Lens, lens: Lens) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PairedImages:
-    """The messages of one frame: time stamp, frame of the camera, colours, and what belongs to them.
+    """The messages of one frame, with its time stamp (ns) and the name of the camera's coordinate frame.
 
-    That is ``partner``: depth, or the right image of a pair; None if there is none.
+    ``partner`` is the depth image or the right image that belongs to ``colour``; None if the bridge has
+    neither.
     """
 
     stamp_ns: int
@@ -105,9 +121,11 @@ class PairedImages:
 
 
 class IncomingFrames:
-    """Pairs the images of two topics; any thread may `add`, another may `take` and `decode`.
+    """Pairs the images of two topics into frames.
 
-    ``rig`` is what is known of a pair and of an IMU; ``check`` counts what is left out, and says why.
+    One thread may `add` while another one calls `take` and `decode`.
+    ``rig`` holds the calibration of a pair and the IMU samples; ``check`` counts unused images with the
+    reasons; ``received`` counts messages by role.
     """
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
@@ -133,7 +151,10 @@ class IncomingFrames:
         self._last_pixels: dict[str, Any] = {}
 
     def add(self, role: Role, data: bytes | memoryview) -> bool:
-        """Take the bytes of a message; return whether a frame became ready.  Nothing is raised."""
+        """Decode and store a message of the topic *role*; return whether a frame became ready for `take`.
+
+        A message that cannot be used is counted in ``check``; no error is raised.
+        """
         with self._lock:
             self.received[role] += 1
             if role == "colour":
@@ -175,12 +196,15 @@ class IncomingFrames:
             return len(self._ready) > before
 
     def take(self) -> PairedImages | None:
-        """Return the oldest frame that is ready, None if there is none, or if the IMU is behind it."""
+        """Return the oldest frame that is ready; None if there is none, or if it waits for an IMU sample."""
         with self._lock:
             return self._ready.popleft() if self._ready and not self._waits_for_imu() else None
 
     def decode(self, images: PairedImages) -> Frame | None:
-        """Return a frame without distortion; None, and a count, if its images make no sense."""
+        """Decode *images* and return the undistorted frame; None if they cannot be used, which is counted.
+
+        An image of a camera_info other than the first one is mapped to the camera of the first one.
+        """
         try:
             stated = self._camera_at(images.stamp_ns)
             wanted, rectifier = stated.rectified, stated.rectifier
@@ -215,10 +239,10 @@ class IncomingFrames:
             return None
 
     def _camera_at(self, stamp_ns: int) -> _StatedCamera:
-        """Return the camera that was stated last before an image.
+        """Return the newest camera_info that is not later than *stamp_ns*, or the oldest one.
 
         Raises:
-            BrokenMessage: There is none, or the newest camera_info cannot be used.
+            BrokenMessage: No camera_info was received, or the newest one cannot be used.
         """
         with self._lock:
             for fault in self._unusable_infos.values():
@@ -241,7 +265,10 @@ class IncomingFrames:
         return f"colours have no {name} within {self._options.pair_within_s:g} s"
 
     def _is_stamp_wrong(self, role: Role, stamp_ns: int) -> bool:
-        """Refuse the stamp of an image that was never set, or that the image before has, too."""
+        """Return whether a time stamp is not set, or equals that of the previous image of the topic.
+
+        Count it.
+        """
         before_ns, self._newest_ns[role] = self._newest_ns.get(role), stamp_ns
         if stamp_ns <= 0:
             fault = "header.stamp is not set"
@@ -253,9 +280,10 @@ class IncomingFrames:
         return True
 
     def _refuse_repeated(self, images: PairedImages) -> None:
-        """Refuse an image with the bytes of the image before: noise changes those of a stationary camera.
+        """Raise _RepeatedImage for an image with the bytes of the previous one: its camera is frozen.
 
-        Depth of a plane may be the same for a moving camera, and so may be images of one brightness.
+        The noise of a working camera changes the bytes even if the camera is stationary.  Depth images, and
+        images with a single brightness, are not checked, since they may be the same for a moving camera.
         """
         for role, message in (("colour", images.colour), ("right", images.partner)):
             if role not in ("colour", self._partner):
@@ -277,11 +305,15 @@ class IncomingFrames:
             )
 
     def _waits_for_imu(self) -> bool:
-        """Return whether the only frame that is ready waits for the sample after it."""
+        """Return whether the only ready frame waits for an IMU sample after it."""
         return len(self._ready) == 1 and self.rig.is_imu_due(self._ready[0].stamp_ns)
 
     def _pair_of(self, left: Frame, right: Any) -> Frame:
-        """Return the rectified pair of a frame as it came, and the message of its right image."""
+        """Return the rectified stereo frame of the decoded frame *left* and the message *right*.
+
+        Raises:
+            BrokenMessage: The camera_info of the right camera was not received.
+        """
         rectification = self.rig.rectification
         if rectification is None:
             raise BrokenMessage(f"no camera_info came on {self._topic('right_info')}")
@@ -292,9 +324,9 @@ class IncomingFrames:
         )  # fmt: skip
 
     def _begin_again(self, role: Role, stamp_ns: int) -> None:
-        """Forget what waits, and take stamps from before the last frame again.
+        """After the clock was set back to *stamp_ns*, drop the waiting images and accept earlier time stamps.
 
-        The other topic may lag behind: its next images, some at most, may still be from before the jump.
+        The next images of the other topics, 30 at most, may still be from before the jump.
         """
         self._jump_ns = stamp_ns
         self._stragglers = Counter(dict.fromkeys(self._waiting, _WAITING))
@@ -306,7 +338,10 @@ class IncomingFrames:
         self._last_ns = -1
 
     def _is_straggler(self, role: Role, stamp_ns: int) -> bool:
-        """Return whether an image is from before the clock jumped back: it would hide its successors."""
+        """Return whether an image is from before the clock was set back; such an image must not be used.
+
+        Its time stamp would make all following images too late.
+        """
         if not self._stragglers[role]:
             return False
         is_old = stamp_ns > self._jump_ns + _JUMP_NS // 2
@@ -314,9 +349,14 @@ class IncomingFrames:
         return is_old
 
     def _learn_camera(self, role: Role, message: Any) -> None:
-        """Take a camera; images of a later camera of the same size are mapped to the first one.
+        """Store the camera_info *message* of the camera *role*.
 
-        A pair is rectified once, so that a change of its cameras is refused; a file of a rig outranks both.
+        A pair is rectified only once, so that a change of its cameras is an error; the file of a rig has
+        priority over the camera_infos of a pair.
+
+        Raises:
+            BrokenMessage: The camera_info cannot be used, its image size changed, or a camera of a pair
+                changed.
         """
         self.rig.learn(role, message)
         if role == "right_info" and self._options.rig:
@@ -333,7 +373,7 @@ class IncomingFrames:
             self._cameras.append(_StatedCamera(_stamp_ns(message), lens, first.camera, rectifier, change))
 
     def _check(self, role: Role, message: Any) -> None:
-        """Refuse an image that is cut off, or unlike the first one of its topic."""
+        """Raise BrokenMessage if an image is incomplete, or its format is not that of the topic's first one."""
         if role not in self._formats:
             image_format = format_of(message, self._kinds[role])
             wanted = "depth" if role == "depth" else "colour"
@@ -348,7 +388,10 @@ class IncomingFrames:
         check_image(message, self._formats[role])
 
     def _pair(self) -> None:
-        """Make frames ready, in the order of time: a colour image with the partner nearest to it."""
+        """Pair each waiting colour image with the partner nearest in time, and make the frames ready.
+
+        A colour image waits as long as a nearer partner may still arrive.
+        """
         colours, partners = self._waiting["colour"], self._waiting[self._partner or "depth"]
         while colours:
             stamp_ns, colour = colours[0]

@@ -1,7 +1,8 @@
-"""Which images a bridge leaves out and why, and the sentence for its status.
+"""Counts of the images that a bridge does not use, by reason, and the sentence about them for its status.
 
-A fault is input that contradicts itself, such as a camera_info that changes: the status names it for some
-seconds.  Images that only came too late or too fast are named where most of them are left out.
+A fault is input that contradicts itself, such as a camera_info that changes: the status of the bridge names
+it for 5 s.  Images that arrived too late or too fast are named only if more than half of the images are left
+out.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ from collections import Counter, deque
 
 __all__ = ["InputCheck"]
 
-STATUS_REPORTS = 5  # reports, 1 s apart: the status names a fault of one image long enough to be read
+# Number of status reports, 1 s apart, that name a fault: long enough for a user to read it.
+STATUS_REPORTS = 5
 
 
 class InputCheck:
-    """Count left-out images by reason; ``left_out`` is since the start, all else of the last reports."""
+    """Counts unused images by reason: ``left_out`` since the start, all else over the last 5 reports."""
 
     def __init__(self) -> None:
         self.left_out: Counter[str] = Counter()
@@ -26,12 +28,12 @@ class InputCheck:
 
     @property
     def fault(self) -> str:
-        """The newest fault of the last reports; empty if there was none."""
+        """The newest fault within the last `STATUS_REPORTS` reports; empty if there was none."""
         return self._fault if self._fault_age < STATUS_REPORTS else ""
 
     @property
     def shortage(self) -> str:
-        """How many colour images of the last reports were left out, if most of them were; else empty."""
+        """The sentence with the number of unused colour images, if more than half were unused; else empty."""
         recent = sum(self._recent, Counter(self._now))
         if 2 * recent["left out"] <= recent["received"]:
             return ""
@@ -42,23 +44,30 @@ class InputCheck:
         self._now["received"] += 1
 
     def leave_out(self, reason: str, *, sentence: str = "", colours: int = 1, partners: int = 0) -> None:
-        """Count images that are left out though nothing is wrong with them; *sentence* says more."""
+        """Count images that are not used although they are valid.
+
+        Args:
+            reason: Key of the count.
+            sentence: Text for the status; empty for *reason*.
+            colours: Number of colour images.
+            partners: Number of depth or right images.
+        """
         self.left_out[reason] += colours + partners
         if colours:
             self._now["left out"] += colours
             self._sentence = sentence or reason
 
     def refuse(self, reason: str, fault: str) -> None:
-        """Count a message that is left out since it cannot be right."""
+        """Count a message that is not used because it is invalid, and report *fault* in the status."""
         self.left_out[reason] += 1
         self.note(fault)
 
     def note(self, fault: str) -> None:
-        """Take a fault of input that is used all the same."""
+        """Report *fault* in the status, without counting a message."""
         self._fault, self._fault_age = fault, 0
 
     def next_report(self) -> None:
-        """Begin the counts of the next report."""
+        """Start the counts of the next status report."""
         self._recent.append(self._now)
         self._now = Counter()
         self._fault_age += 1

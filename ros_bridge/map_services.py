@@ -1,4 +1,4 @@
-"""Services of the bridge that need the platform: publish a map, relocalise in it, localise in another one."""
+"""The bridge's ROS services for maps: publish a map, relocalise in the live map, localise in a stored map."""
 
 from __future__ import annotations
 
@@ -20,29 +20,33 @@ from rse_pf.wire.live_map import PUBLISH, LiveMapRequest
 
 __all__ = ["MapServices", "as_json"]
 
+# Deadline of each command that these services send to the platform, in seconds.
 _CALL_S = 20.0
 
 
 class MapServices:
-    """What a robot of ROS asks of the maps of its tenant; each method returns JSON values."""
+    """The ROS services of one bridge that use maps of the tenant.
+
+    Each method returns a reply of JSON values.
+    """
 
     def __init__(self, robot: Robot, mapper: Mapper | LiveMapper, options: BridgeOptions) -> None:
-        """Describe them; the data service is connected to when it is needed first."""
+        """Describe the services; the connection to the data service is opened when it is first needed."""
         self._robot, self._mapper, self._options = robot, mapper, options
         self._data: DataClient | None = None
         self._object: tuple[str, str] | None = None
 
     def close(self) -> None:
-        """End the connection to the data service."""
+        """Close the connection to the data service, if it is open."""
         if self._data is not None:
             self._data.close()
 
     async def publish(self) -> dict[str, Any]:
-        """Publish the live map, or this robot's own map as the next version of a map.
+        """Publish the live map, or commit the robot's own map as the next version of the map ``publish_as``.
 
         Raises:
             UsageError: The map is the robot's own, and the parameter ``publish_as`` is empty.
-            RsePfError: The platform refuses it.
+            RsePfError: The platform rejected it.
         """
         if isinstance(self._mapper, LiveMapper):
             request = LiveMapRequest(map=self._mapper.name)
@@ -56,10 +60,13 @@ class MapServices:
         return {"map": name, "version": version}
 
     async def relocalise(self) -> dict[str, Any]:
-        """Ask for the place in the live map with the next keyframe, without the usual pause.
+        """Let the mapper request a relocalisation with the next keyframe, without the usual pause.
+
+        Return the name of the live map, whether the robot is aligned with it now, and the reason if it is
+        not.
 
         Raises:
-            UsageError: The robot shares no live map.
+            UsageError: The robot does not use a live map.
         """
         if not isinstance(self._mapper, LiveMapper):
             raise UsageError("a map of its own begins where the robot did", hint="set the parameter map")
@@ -67,14 +74,14 @@ class MapServices:
         return {"map": self._mapper.name, "aligned": self._mapper.aligned, "reason": self._mapper.reason}
 
     async def localise(self, camera: Camera | None) -> dict[str, Any]:
-        """Return where the last image with a pose is in a stored map: the reply of ``localise``.
+        """Return the reply of the service ``localise``: the pose of the last tracked image in a stored map.
 
         Args:
-            camera: That took the images; None before the first one.
+            camera: The camera of the images; None before the first image.
 
         Raises:
-            UsageError: The parameter ``localise_in`` is empty, or there is no such image yet.
-            RsePfError: There is no such map, or the platform refuses the question.
+            UsageError: The parameter ``localise_in`` is empty, or no image with depth has a pose yet.
+            RsePfError: The map does not exist, or the platform rejected the request.
         """
         name = self._options.localise_in
         if not name:
@@ -97,7 +104,13 @@ class MapServices:
         return self._data
 
     def _object_of(self, name: str) -> str:
-        """Return the digest of the head of a map, as an object of this robot: services reach no others."""
+        """Return the digest of the newest version of the map *name*, uploaded as an object of this robot.
+
+        A service can read only the objects of the robot that calls it.
+
+        Raises:
+            NotFound: There is no such map.
+        """
         version = str(self._client.maps().get(name, ""))
         if not version:
             raise NotFound(f"there is no map {name[:80]!r}", hint="rse-pf map list shows the maps")
@@ -107,7 +120,7 @@ class MapServices:
 
 
 def as_json(value: Any) -> str:
-    """Return a reply as JSON: arrays as lists, bytes in base64."""
+    """Return *value*, the reply of a service, as JSON: arrays as lists, bytes in base64."""
     return json.dumps(value, default=_plain)
 
 

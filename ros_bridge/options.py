@@ -1,4 +1,4 @@
-"""What a bridge is told: by arguments of a command line, parameters of a launch file, or a program."""
+"""The options of a bridge, from a command line, the parameters of a launch file, or a program."""
 
 from __future__ import annotations
 
@@ -18,62 +18,77 @@ HELP = {
     "url": "address of the platform: ws://HOST:PORT/ws",
     "token_file": "file that holds the robot's token",
     "enrolment": "file of rse-pf robot enrol --out, instead of both",
-    "namespace": "name of this robot, before its topics and frames",
-    "map": "live map that it shares with other robots (default: a map of its own)",
-    "colour": "topic of the colours",
-    "depth": "topic of depth registered to them; empty: none",
-    "info": "topic of the camera_info of the colours",
+    "namespace": "name of this robot, put before the names of its topics and frames",
+    "map": "live map that the robot shares with other robots (default: a map of its own)",
+    "colour": "topic of the colour images",
+    "depth": "topic of the depth images registered to the colour images; empty: none",
+    "info": "topic of the camera_info of the colour images",
     "right": "topic of the right images of a stereo pair, instead of depth; empty: none",
     "right_info": "topic of the camera_info of the right images",
     "imu": "topic of an IMU; needs rig",
-    "rig": "file of the rig, rig.json; empty: by both camera_info",
+    "rig": "file of the rig, rig.json; empty: calibration by both camera_info",
     "depth_scale": "units of a 16-bit depth image in a metre",
-    "pair_within_s": "colour and depth belong together up to this difference of time",
-    "queue_frames": "so many frames wait while another is tracked",
+    "pair_within_s": "largest difference in time of a colour image and its depth or right image, in seconds",
+    "queue_frames": "largest number of frames that wait while another is tracked",
     "map_frame": "name of the frame of the map",
     "odom_frame": "name of the odometry frame",
     "camera_frame": "name of the camera's frame (default: as in the images)",
     "publish_odom": "whether to publish the transform from odometry frame to camera",
-    "cloud_every_s": "time between two clouds",
-    "path_poses": "most poses of a path",
+    "cloud_every_s": "time between two clouds, in seconds",
+    "path_poses": "largest number of poses of a path",
     "out": "folder that the service save writes to",
-    "publish_as": "name of the map that the service publish makes of a map of its own",
-    "localise_in": "name of the map in which the service localise looks",
+    "publish_as": "name under which the service publish stores the robot's own map",
+    "localise_in": "name of the stored map in which the service localise finds the pose",
 }
-"""What each option is, for a command line and for the description of a parameter."""
+"""The help text of each option, for the command line and for the description of a ROS 2 parameter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BridgeOptions:
-    """How a robot of ROS takes part.
+    """The options of a bridge: its platform, topics, coordinate frames and maps.
 
     Attributes:
         url: Address of the platform, ``ws://HOST:PORT/ws``.
         token_file: File that holds the robot's token; it is read again for each connection.
-        enrolment: File of ``rse-pf robot enrol --out``, instead of both.
-        namespace: Of this robot, such as ``robot1``: before the names of its topics and its odometry frame.
-        map: Name of the live map that it shares with others; empty: a map of its own.
-        colour: Topic of the colours: ``Image``, or ``CompressedImage`` if its name ends with ``compressed``.
-        depth: Topic of depth that is registered to the colours, ``compressedDepth`` likewise; empty: none.
-        info: Topic of the ``CameraInfo`` of the colours.
-        right: Topic of the right images of a stereo pair, whose left ones are the colours; then depth is not
-            used.  Empty: no pair.
+        enrolment: File of ``rse-pf robot enrol --out``, instead of ``url`` and ``token_file``.
+        namespace: Name of this robot, such as ``robot1``, put before the names of its topics and its odometry
+            frame.
+        map: Name of the live map that the robot shares with other robots; empty: the robot has a map of its
+            own.
+        colour: Topic of the colour images: ``Image``, or ``CompressedImage`` if its name ends with
+            ``compressed``.
+        depth: Topic of the depth images that are registered to the colour images; compressed if its name ends
+            with
+            ``compressedDepth``.  Empty: no depth.
+        info: Topic of the ``CameraInfo`` of the colour images.
+        right: Topic of the right images of a stereo pair, whose left images are the colour images; depth
+            images are
+            not used then.  Empty: no pair.
         right_info: Topic of the ``CameraInfo`` of the right images.
-        imu: Topic of an IMU (``sensor_msgs/Imu``), whose place and noise the rig tells; empty: none.
-        rig: File of the rig, such as ``rse-pf camera calibrate --stereo`` writes; empty: by ``CameraInfo``.
+        imu: Topic of an IMU (``sensor_msgs/Imu``), whose pose and noise ``rig`` states; empty: no IMU.
+        rig: File of the rig, as ``rse-pf camera calibrate --stereo`` writes it; empty: the calibration of a
+            pair is
+            that of both ``CameraInfo`` topics.
         depth_scale: Units of a 16-bit depth image in a metre.
-        pair_within_s: Colour and depth belong together up to this difference of their time stamps.
-        queue_frames: So many frames wait while another is tracked; the oldest is dropped and counted.
-        map_frame: Name of the frame of the map.
-        odom_frame: Name of the odometry frame of this bridge.
-        camera_frame: Name of the camera's frame; empty: as in the images.
-        publish_odom: Whether the transform from odometry frame to camera is published; not if something else
-            publishes a parent of the camera's frame.
-        cloud_every_s: Time between two clouds.
-        path_poses: A path has so many poses at most; from there on, each second one is left out.
-        out: Folder that the service ``save`` writes to; empty: it is refused.
-        publish_as: Name of the map that the service ``publish`` makes of a map of its own; empty: refused.
-        localise_in: Name of the map in which the service ``localise`` looks; empty: it is refused.
+        pair_within_s: Largest difference (s) of the time stamps of a colour image and its depth or right
+            image.
+        queue_frames: Largest number of frames that wait while another is tracked; above it, the oldest frame
+            is
+            dropped and counted.
+        map_frame: Name of the coordinate frame of the map.
+        odom_frame: Name of the odometry frame of this bridge, without the namespace.
+        camera_frame: Name of the camera's frame; empty: the name in the messages of the images.
+        publish_odom: Whether the transform from odometry frame to camera is published; set it to False if
+            another
+            node publishes a parent of the camera's frame.
+        cloud_every_s: Time between two clouds, in seconds.
+        path_poses: Largest number of poses of a path; above it, every second pose is left out.
+        out: Folder that the service ``save`` writes to; empty: the service fails.
+        publish_as: Name under which the service ``publish`` stores the robot's own map; empty: the service
+            fails.
+        localise_in: Name of the stored map in which the service ``localise`` finds the pose; empty: the
+            service
+            fails.
 
     Raises:
         UsageError: A value cannot be used.
@@ -136,11 +151,14 @@ class BridgeOptions:
 
     @property
     def partner(self) -> Literal["right", "depth", ""]:
-        """The role of what belongs to each colour image: its right one, or depth; empty: nothing."""
+        """The role of the second image of a frame: "right" for a stereo pair, else "depth".
+
+        Empty for none.
+        """
         return "right" if self.right else "depth" if self.depth else ""
 
     def check_rig(self, *, has_right: bool, has_imu: bool) -> None:
-        """Raise UsageError if the file of the rig lacks what has a topic."""
+        """Raise UsageError if the file of the rig lacks the right camera or the IMU whose topic is set."""
         for topic, name, is_there in ((self.right, "right camera", has_right), (self.imu, "IMU", has_imu)):
             if topic and not is_there:
                 raise UsageError(
@@ -150,10 +168,10 @@ class BridgeOptions:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> BridgeOptions:
-        """Return the options that *values* name, such as the private parameters of a node.
+        """Return the options with *values* by name, such as the private parameters of a node.
 
         Raises:
-            UsageError: A name is unknown, or a value is of another type.
+            UsageError: A name is unknown, or a value cannot be converted to the type of its option.
         """
         kinds = {field.name: str(field.type) for field in fields(BridgeOptions)}
         unknown = sorted(set(values) - set(kinds))
@@ -164,7 +182,7 @@ class BridgeOptions:
         return BridgeOptions(**{name: _value(name, kinds[name], value) for name, value in values.items()})
 
     def named(self, topic: str) -> str:
-        """Return the name of a topic of this robot."""
+        """Return the absolute name of *topic*: the namespace is put before a name without a leading slash."""
         if topic.startswith("/"):
             return topic
         prefix = self.namespace.strip("/")
@@ -172,13 +190,20 @@ class BridgeOptions:
 
     @property
     def own_odom_frame(self) -> str:
-        """The name of the odometry frame with the robot's namespace, since frames have none of their own."""
+        """The name of the odometry frame with the robot's namespace before it.
+
+        ROS adds none to frame names.
+        """
         prefix = self.namespace.strip("/")
         return f"{prefix}/{self.odom_frame}" if prefix else self.odom_frame
 
 
 def _value(name: str, kind: str, value: Any) -> Any:
-    """Return a value as the type of its field; launch files give numbers and words as they look."""
+    """Return *value* converted to *kind*, the type of the option *name*; launch files may use another type.
+
+    Raises:
+        UsageError: The value cannot be converted.
+    """
     try:
         if kind == "str":
             return str(value)

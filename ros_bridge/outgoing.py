@@ -1,8 +1,8 @@
-"""From tracked frames to messages of ROS, with the time stamps of the frames.
+"""Turn tracked frames into ROS messages, with the time stamps of the frames.
 
-Covariances leave the platform as those of a twist on the left of the pose that maps the world into the
-camera; ROS wants those of the camera's position, and of its rotation about the axes of the frame that it is
-in.  `ros_covariance` and `with_alignment` turn one into the other.
+The platform states the covariance of a twist that is multiplied on the left of ``T_camera_world``.  ROS
+expects the covariance of the camera's position, and of its rotation about the fixed axes of the parent frame.
+`ros_covariance` and `with_alignment` convert them.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from rse_pf.geometry import Array
 
 __all__ = ["Message", "OutgoingMessages", "advertised", "ros_covariance", "with_alignment"]
 
+# Covariance (6, 6) of a pose without one: so large that filters give the pose no weight.
 _UNKNOWN = np.diag(np.full(6, 1e6))
-"""Covariance of a pose that comes with none: so large that no filter believes it."""
+# Levels of ``diagnostic_msgs/DiagnosticStatus``.
 _OK, _WARNING, _ERROR = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """The bytes of a message: name of its topic, its type, and whether late subscribers get it, too."""
+    """An encoded message: the name of its topic, its type as ROS 2 names it, and its bytes."""
 
     topic: str
     kind: str
@@ -43,26 +44,26 @@ class Message:
 
 
 def ros_covariance(covariance: Array, T_world_camera: Array) -> Array:
-    """Return the ``(6, 6)`` covariance of position and rotation in the world.
+    """Return the covariance ``(6, 6)`` of the camera's position and rotation in the world frame.
 
     Args:
-        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_camera_world``.
-        T_world_camera: ``(4, 4)``.
+        covariance: ``(6, 6)``, of the twist (metres, radians) on the left of ``T_camera_world``.
+        T_world_camera: ``(4, 4)``, the pose of the camera.
     """
     # exp(xi) T_camera_world has the inverse T_world_camera exp(-xi): both parts are rotated into the world.
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = T_world_camera[:3, :3]
-    turned: Array = turn @ covariance @ turn.T
-    return turned
+    rotation = np.zeros((6, 6))
+    rotation[:3, :3] = rotation[3:, 3:] = T_world_camera[:3, :3]
+    rotated: Array = rotation @ covariance @ rotation.T
+    return rotated
 
 
 def with_alignment(covariance: Array, T_map_camera: Array, alignment: Array) -> Array:
-    """Return the ``(6, 6)`` covariance of a pose in the map: its own, and that of its alignment.
+    """Return the covariance ``(6, 6)`` of a pose in the map: that of the pose plus that of the alignment.
 
     Args:
-        covariance: ``(6, 6)`` of position and rotation in the map, as if the alignment were exact.
-        T_map_camera: ``(4, 4)``.
-        alignment: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_odom``.
+        covariance: ``(6, 6)``, of position and rotation in the map if the alignment were exact.
+        T_map_camera: ``(4, 4)``, the pose of the camera in the map.
+        alignment: ``(6, 6)``, of the twist (metres, radians) on the left of ``T_map_odom``.
     """
     x, y, z = T_map_camera[:3, 3]
     lever = np.eye(6)
@@ -72,7 +73,10 @@ def with_alignment(covariance: Array, T_map_camera: Array, alignment: Array) -> 
 
 
 def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
-    """Return the topics that a bridge publishes: names, types, and whether late subscribers get the last."""
+    """Return name, type and latching of each topic that a bridge publishes.
+
+    Subscribers of a latched topic receive the last message when they subscribe.
+    """
     topics = (
         ("rse_pf/pose", POSE_WITH_COVARIANCE, False),
         ("rse_pf/odometry", ODOMETRY, False),
@@ -86,7 +90,7 @@ def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
 
 
 class OutgoingMessages:
-    """Makes the messages of one robot; it keeps its path."""
+    """Makes the ROS messages of one robot, and stores the robot's path for them."""
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
         self._maker, self._options = maker, options
@@ -103,14 +107,16 @@ class OutgoingMessages:
         T_map_odom: Array | None,
         alignment: Array | None = None,
     ) -> list[Message]:
-        """Return pose, odometry and transforms of a frame; a lost one gives nothing.
+        """Return the messages with pose, odometry and transforms of a frame; none for a lost frame.
+
+        The pose is in the map if *T_map_odom* is known, else in the odometry frame.
 
         Args:
             tracked: The result of the mapper.
-            stamp_ns: Time stamp of its images.
+            stamp_ns: Time stamp of the frame's images.
             camera_frame: Name of the camera's frame.
-            T_map_odom: ``(4, 4)``, where the odometry frame is in the map; None if that is unknown.
-            alignment: ``(6, 6)``, its covariance, None if unknown or exact.
+            T_map_odom: ``(4, 4)``, pose of the odometry frame in the map; None if it is unknown.
+            alignment: ``(6, 6)``, covariance of *T_map_odom*; None if it is unknown or zero.
         """
         T_odom_camera = tracked.T_world_camera
         if T_odom_camera is None:
@@ -144,7 +150,10 @@ class OutgoingMessages:
         return messages
 
     def path(self) -> list[Message]:
-        """Return the path in the odometry frame: the transform to the map moves all of it at once."""
+        """Return the message with the path in the odometry frame; none before the first pose.
+
+        The transform from map to odometry frame moves the whole path when the map is corrected.
+        """
         if not self._path:
             return []
         frame = self._options.own_odom_frame
@@ -152,21 +161,25 @@ class OutgoingMessages:
         return [self._message("rse_pf/path", PATH, made)]
 
     def imu_place(self, stamp_ns: int, camera_frame: str, imu_frame: str, T_camera_imu: Array) -> Message:
-        """Return where the IMU is on the camera: ``(4, 4)``, metres."""
+        """Return the static transform *T_camera_imu* ``(4, 4)``, the pose of the IMU in the camera frame."""
         moved = self._maker.transform(stamp_ns, camera_frame, imu_frame, T_camera_imu)
         return self._message("/tf_static", TF, self._maker.transforms([moved]))
 
     def cloud(
         self, stamp_ns: int, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]
     ) -> list[Message]:
-        """Return the robot's own cloud in its odometry frame."""
+        """Return the message with the cloud in the odometry frame: *points* ``(n, 3)`` (m), RGB ``(n, 3)``."""
         made = self._maker.cloud(stamp_ns, self._options.own_odom_frame, points, colours)
         return [self._message("rse_pf/cloud", POINT_CLOUD, made)]
 
     def diagnostics(
         self, stamp_ns: int, *, trouble: str, is_working: bool, values: dict[str, str]
     ) -> Message:
-        """Return how the bridge is: well, with a warning, or not working, and why."""
+        """Return the status message of the bridge.
+
+        Its level is error unless *is_working*, else warning if *trouble* is not empty, else OK; its text is
+        *trouble*, and *values* are its key-value pairs.
+        """
         level = _ERROR if not is_working else _WARNING if trouble else _OK
         name = f"rse_pf: {self._options.namespace.strip('/') or 'robot'}"
         made = self._maker.diagnostics(stamp_ns, name, level, trouble or "poses are given", values)
@@ -176,7 +189,10 @@ class OutgoingMessages:
         return Message(self._options.named(topic), kind, self._maker.encode(kind, message))
 
     def _extend_path(self, stamp_ns: int, T_odom_camera: Array) -> None:
-        """Add a pose; where the path is full, each second pose goes, and later ones come half as often."""
+        """Add a pose to the path.
+
+        Above ``path_poses``, drop every second pose and add later ones half as often.
+        """
         self._counted += 1
         if self._counted % self._every:
             return
@@ -187,7 +203,7 @@ class OutgoingMessages:
             self._every *= 2
 
     def _move_path(self, T_new_old: Array) -> None:
-        """Express the path in the odometry frame as it is now."""
+        """Transform the path into the new odometry frame by *T_new_old* ``(4, 4)``."""
         frame = self._options.own_odom_frame
         moved = ((stamp_ns, T_new_old @ T) for stamp_ns, T, _ in self._path)
         self._path = [(stamp_ns, T, self._maker.pose(stamp_ns, frame, T)) for stamp_ns, T in moved]

@@ -1,6 +1,7 @@
-"""The rig behind the topics of a bridge: a stereo pair by both ``CameraInfo`` or by a file, and an IMU.
+"""The sensor rig of a bridge: the calibration of a stereo pair, and an IMU with its samples.
 
-It decodes no image and pairs none; `ros_bridge.incoming` does.
+The calibration of the pair is that of both ``CameraInfo`` topics, or of the file of the rig.  Images are
+paired and decoded in `ros_bridge.incoming`.
 """
 
 from __future__ import annotations
@@ -22,21 +23,27 @@ from rse_pf.geometry import Array, inverse
 
 __all__ = ["RigTopics"]
 
+# Largest number of IMU samples that wait for the next frame: 10 s of an IMU with 2 kHz.
 _KEPT_SAMPLES = 20_000
-"""Ten seconds of an IMU of 2 kHz wait for the next frame."""
+# A time stamp this far before the previous one, in ns, means that the clock was set back or a bag plays
+# again.
 _JUMP_NS = 1_000_000_000
+# If the newest IMU sample is this far behind a frame, in ns, the frame no longer waits: the IMU is silent.
 _LATE_NS = 200_000_000
-"""An IMU that is so far behind the camera is silent: nobody waits for it."""
 
 
 class RigTopics:
-    """What is known of a pair and of an IMU; ``rectification`` is None until both cameras are known."""
+    """The calibration of a stereo pair and of an IMU, and the IMU samples that wait for a frame.
+
+    ``rectification`` is None until both cameras are known; ``imu_frame`` is the frame name in the IMU's
+    messages.
+    """
 
     def __init__(self, options: BridgeOptions) -> None:
-        """Read the file of the rig, if there is one; ``imu_frame`` is the frame of the samples.
+        """Read the file of the rig, if the options name one.
 
         Raises:
-            UsageError: The file cannot be used, or it lacks the right camera or the IMU that has a topic.
+            UsageError: The file cannot be used, or it lacks the right camera or the IMU whose topic is set.
         """
         self.rectification: Rectification | None = None
         self.imu_frame = ""
@@ -52,19 +59,22 @@ class RigTopics:
 
     @property
     def T_body_camera(self) -> Array | None:
-        """The ``(4, 4)`` pose of the camera of the frames in the body; None if it is not known."""
+        """The pose ``(4, 4)`` of the (rectified left) camera in the body frame; None if it is not known."""
         if self.rectification is not None:
             return self.rectification.T_body_camera
         return None if self._rig is None else self._rig.left.T_body_camera
 
     @property
     def T_camera_imu(self) -> Array | None:
-        """The ``(4, 4)`` pose of the IMU in the camera of the frames; None if the rig does not tell it."""
+        """The pose ``(4, 4)`` of the IMU in the frame of that camera; None if the rig does not state it."""
         rig, T = self._rig, self.T_body_camera
         return None if rig is None or rig.imu is None or T is None else inverse(T) @ rig.imu.T_body_imu
 
     def learn(self, role: str, message: Any) -> None:
-        """Take the ``CameraInfo`` of a camera; both together give the pair, once.
+        """Store the ``CameraInfo`` *message* of the camera *role*.
+
+        With that of both cameras, make the rectification.
+        Later messages, and those of a bridge without a pair, are ignored.
 
         Raises:
             UsageError: The pair cannot be used: the cameras are swapped, or their distance is not known.
@@ -80,10 +90,13 @@ class RigTopics:
             self._rectify(*pair_of(left, right, None))
 
     def add_imu(self, message: Any, stamp_ns: int) -> None:
-        """Take a sample; one that is older than the last one is left out, unless the clock jumped back.
+        """Add the IMU sample *message*; ignore one that is not newer than the last sample.
+
+        If it is older by at least 1 s, the clock was set back: the stored samples are dropped, and it is
+        added.
 
         Raises:
-            BrokenMessage: It lacks rates or accelerations, or a number is not finite.
+            BrokenMessage: The message lacks rates or accelerations, or a number is not finite.
         """
         numbers = numbers_of_imu(message)
         self.imu_frame = str(message.header.frame_id).lstrip("/")
@@ -95,14 +108,20 @@ class RigTopics:
         self._samples.append((stamp_ns, numbers))
 
     def is_imu_due(self, stamp_ns: int) -> bool:
-        """Return whether the sample after a frame is still to come; without it, its motion ends too early."""
+        """Return whether a frame at *stamp_ns* must wait for an IMU sample after it.
+
+        False if there is such a sample or no IMU, or if the IMU is at least 0.2 s behind the frame.
+        """
         if not self._samples or not self._options.imu or self._rig is None:
             return False
         behind_ns = stamp_ns - self._imu_stamp_ns(self._samples[-1][0])
         return 0 < behind_ns < _LATE_NS
 
     def imu_until(self, stamp_ns: int) -> ImuSamples | None:
-        """Return the samples since the last frame, from one before it to one after *stamp_ns*; or None."""
+        """Return the IMU samples from the one before the last frame to the one after *stamp_ns*.
+
+        Samples before them are dropped.  None without an IMU, or if the pose of the camera is not known.
+        """
         rig, T = self._rig, self.T_body_camera
         if rig is None or rig.imu is None or T is None or not self._samples:
             return None
@@ -110,7 +129,7 @@ class RigTopics:
         rows = list(self._samples)
         stamps_ns = np.array([self._imu_stamp_ns(stamp) for stamp, _ in rows], dtype=np.int64)
         if self._until_ns < 0:
-            self._until_ns = stamp_ns  # as in bags: what was before the first frame is not asked for
+            self._until_ns = stamp_ns  # the first frame gets no samples from before it, as with bags
         first = max(0, int(np.searchsorted(stamps_ns, self._until_ns, side="right")) - 1)
         last = int(np.searchsorted(stamps_ns, stamp_ns, side="left")) + 1
         self._until_ns = stamp_ns
@@ -125,7 +144,7 @@ class RigTopics:
         )
 
     def _imu_stamp_ns(self, stamp_ns: int) -> int:
-        """Return the time of a sample on the clock of the camera."""
+        """Return the time stamp of an IMU sample by the clock of the camera, in ns."""
         return stamp_ns - (0 if self._rig is None else round(1e9 * self._rig.left.time_offset_s))
 
     def _rectify(self, left: RigCamera, right: RigCamera) -> None:

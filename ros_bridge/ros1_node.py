@@ -1,7 +1,8 @@
-"""The bridge as a node of ROS 1: messages travel through rospy as bytes, and are read by the core alone.
+"""The bridge as a node of ROS 1: rospy transports messages as bytes, and `ros_bridge.incoming` decodes them.
 
-A master that dies takes the names of all topics with it; links that exist go on.  `Master` looks every two
-seconds whether the master still knows this node, and registers it again where it does not.
+When the ROS master is restarted, the registrations of all topics are lost, while existing connections
+continue. `_Master` checks every 2 s whether the master knows this node, and registers the node again if it
+does not.
 """
 
 from __future__ import annotations
@@ -32,22 +33,30 @@ from rse_pf.terminal import show
 
 __all__ = ["CALL_REPLY", "CALL_REQUEST", "run_ros1_node"]
 
+# Folder in which Debian installs rospy for the Python of the system.
 _DEBIAN = Path("/usr/lib/python3/dist-packages")
+# Time between two checks of the registration at the ROS master, in seconds.
 _MASTER_EVERY_S = 2.0
+# Time limit of a request to the ROS master, in seconds.
 _MASTER_S = 1.0
+# Longest wait of a ROS service for its result, in seconds.
 _CALL_S = 30.0
 CALL_REQUEST = "string service\nstring payload"
+"""Definition of the request of the ROS service ``~call``, as in ``Call.srv``."""
 CALL_REPLY = "bool ok\nstring reply\nstring code\nstring message"
+"""Definition of the reply of the ROS service ``~call``, as in ``Call.srv``."""
 
 
 def run_ros1_node(arguments: list[str], options: dict[str, Any]) -> int:
-    """Run the node until it is ended; *options* come before the private parameters of the node.
+    """Run the node until a signal or rospy ends it; return the exit code.
+
+    *arguments* are those of rospy, such as remappings; *options* override the private parameters of the node.
 
     Raises:
         UsageError: rospy is not installed, there is no master, or a parameter cannot be used.
         RsePfError: The platform refuses the robot.
     """
-    BridgeOptions.of(options)  # a wrong word is told before a master is waited for
+    BridgeOptions.of(options)  # raises the error of a wrong option before the wait for a ROS master
     rospy = _import_rospy()
     _wait_for_master()
     rospy.init_node("rse_pf_bridge", argv=arguments, disable_signals=True)
@@ -57,11 +66,11 @@ def run_ros1_node(arguments: list[str], options: dict[str, Any]) -> int:
     try:
         return asyncio.run(node.run())
     finally:
-        rospy.signal_shutdown("the bridge has ended")
+        rospy.signal_shutdown("the bridge has stopped")
 
 
 class _Node:
-    """The topics and services of one bridge in rospy."""
+    """The publishers, subscribers and services of one bridge in rospy."""
 
     def __init__(self, rospy: Any, options: BridgeOptions) -> None:
         self._rospy, self._options = rospy, options
@@ -69,7 +78,7 @@ class _Node:
         self._publishers: dict[str, Any] = {}
 
     async def run(self) -> int:
-        """Bridge until a signal; the exit code is 0."""
+        """Run the bridge until a signal or a shutdown of rospy; return the exit code 0."""
         loop, ended = asyncio.get_running_loop(), end_by_signal()
         self._rospy.on_shutdown(lambda: _set_in(loop, ended))
         for topic, kind, latched in advertised(self._options):
@@ -101,14 +110,14 @@ class _Node:
         self._publishers[message.topic].publish(raw)
 
     def _raw(self, kind: str) -> type[Any]:
-        """Return a class of rospy whose messages are bytes, with name and sum of the true type."""
+        """Return a rospy message class that holds raw bytes, with name and MD5 sum of the type *kind*."""
         text, md5 = self._maker.types.generate_msgdef(kind, ros_version=1)
         package, _, name = kind.partition("/msg/")
         parts = {"_type": f"{package}/{name}", "_md5sum": md5, "_full_text": text, "_has_header": False}
         return type(f"Raw{name}", (self._rospy.AnyMsg,), {"__slots__": ["_buff"], **parts})
 
     def _offer(self, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:
-        """Offer ``~call``, and the triggers of a bridge."""
+        """Offer the ROS services of the bridge: ``~call``, and one without a request for each trigger."""
 
         def wait(work: Any) -> CallReply:
             reply: CallReply = asyncio.run_coroutine_threadsafe(work, loop).result(_CALL_S)
@@ -136,7 +145,7 @@ class _Node:
 
 
 class _Master:
-    """Registers this node again where the master has forgotten it; by the public interfaces of both."""
+    """Registers this node again at a ROS master that was restarted, by the XML-RPC interfaces of both."""
 
     def __init__(self, rospy: Any) -> None:
         self.stop = threading.Event()
@@ -144,14 +153,14 @@ class _Master:
         self._name = str(rospy.get_name())
 
     def watch(self) -> None:
-        """Look until `stop` is set."""
+        """Check the registration every 2 s until `stop` is set; an unreachable master is ignored."""
         while not self.stop.wait(_MASTER_EVERY_S):
             with contextlib.suppress(OSError, xmlrpc.client.Error):
-                self._look()
+                self._register_if_unknown()
 
-    def _look(self) -> None:
+    def _register_if_unknown(self) -> None:
         rosgraph = importlib.import_module("rosgraph")
-        master: Any = xmlrpc.client.ServerProxy(rosgraph.get_master_uri(), transport=_Impatient())
+        master: Any = xmlrpc.client.ServerProxy(rosgraph.get_master_uri(), transport=_TimedTransport())
         code, _, _ = master.lookupNode(self._name, self._name)
         if code == 1:
             return
@@ -159,7 +168,7 @@ class _Master:
         topics: Any = importlib.import_module("rospy.impl.registration").get_topic_manager()
         services: Any = importlib.import_module("rospy.impl.registration").get_service_manager()
         uri = core.get_node_uri()
-        own: Any = xmlrpc.client.ServerProxy(uri, transport=_Impatient())
+        own: Any = xmlrpc.client.ServerProxy(uri, transport=_TimedTransport())
         for topic, kind in topics.get_publications():
             master.registerPublisher(self._name, topic, kind, uri)
         for topic, kind in topics.get_subscriptions():
@@ -168,11 +177,11 @@ class _Master:
                 own.publisherUpdate("/master", topic, publishers)
         for service, address in services.get_services():
             master.registerService(self._name, service, address, uri)
-        show("the master had forgotten this node: registered again")
+        show("the ROS master did not know this node, and has it registered again")
 
 
-class _Impatient(xmlrpc.client.Transport):
-    """A transport that does not wait for a master that hangs."""
+class _TimedTransport(xmlrpc.client.Transport):
+    """An XML-RPC transport whose requests fail after 1 s, so that a master that hangs does not block."""
 
     def make_connection(self, host: Any) -> Any:
         connection = super().make_connection(host)
@@ -190,13 +199,22 @@ def _receiver(bridge: Bridge, role: Role) -> Callable[[Any], None]:
 def _service_class(
     rospy: Any, kind: str, request: str, reply: str, takes: list[str], gives: list[str]
 ) -> type[Any]:
-    """Return a service class of rospy, without a package that was built for it."""
+    """Return a service class for rospy that needs no package with generated messages.
+
+    Args:
+        rospy: The module.
+        kind: Name of the service type, such as ``std_srvs/Trigger``.
+        request: Definition of the request, from which the MD5 sum is computed.
+        reply: Definition of the reply.
+        takes: Types of the request's fields, "bool" or "string".
+        gives: Types of the reply's fields.
+    """
     md5 = hashlib.md5((request + reply).encode(), usedforsecurity=False).hexdigest()
     name = kind.rpartition("/")[2]
 
     def message(part: str, kinds: list[str]) -> type[Any]:
         class Fields(rospy.AnyMsg):  # type: ignore[misc]  # rospy has no types
-            """Values in the order of the definition."""
+            """A request or reply: ``values`` holds its fields in the order of the definition."""
 
             __slots__ = ["values"]
             _type, _md5sum, _full_text, _slot_types = kind + part, md5, request or reply, kinds
@@ -238,7 +256,11 @@ def _set_in(loop: asyncio.AbstractEventLoop, event: asyncio.Event) -> None:
 
 
 def _import_rospy() -> Any:
-    """Import rospy; Debian has it beside the Python of the system, which an environment does not see."""
+    """Import rospy, if necessary from the packages of Debian's Python, which virtual environments do not see.
+
+    Raises:
+        UsageError: rospy cannot be imported.
+    """
     if importlib.util.find_spec("rospy") is None and (_DEBIAN / "rospy").is_dir():
         sys.path.append(str(_DEBIAN))
     try:

@@ -1,4 +1,4 @@
-"""The bridge as a node of ROS 2: messages pass rclpy as CDR bytes, and are read by the core alone."""
+"""The bridge as a node of ROS 2: rclpy transports messages as CDR bytes, and `incoming` decodes them."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ from rse_pf.terminal import show
 
 __all__ = ["publishers_of", "run_ros2_node"]
 
+# Longest wait of a ROS service for its result, in seconds.
 _CALL_S = 30.0
+# Parameters that every node of ROS 2 has, and that are no options of the bridge.
 _OF_ROS = ("use_sim_time", "start_type_description_service")
-"""Parameters that each node of ROS 2 has."""
 
 
 def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
-    """Run the node until it is ended; *options* come before the parameters of the node.
+    """Run the node until a signal ends it; return the exit code.
+
+    *arguments* are those of rclpy, such as ``--ros-args``; *options* override the parameters of the node.
 
     Raises:
         UsageError: rclpy is not installed, or a parameter cannot be used.
-        RsePfError: The platform refuses the robot.
+        RsePfError: The platform rejected the robot.
     """
     try:
         rclpy = importlib.import_module("rclpy")
@@ -38,7 +41,7 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
             f"rclpy cannot be imported: {error}",
             hint="source the setup.bash of your ROS 2, and use its Python, 3.10 or newer",
         ) from error
-    signals = importlib.import_module("rclpy.signals").SignalHandlerOptions.NO  # asyncio has them
+    signals = importlib.import_module("rclpy.signals").SignalHandlerOptions.NO  # asyncio handles signals
     try:
         rclpy.init(args=["rse-pf-ros", *arguments], signal_handler_options=signals)
         node = rclpy.create_node(
@@ -64,7 +67,7 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
 
 
 def _declare(node: Any, options: BridgeOptions) -> None:
-    """Declare each option as a parameter with the value that is used; none can be set while the node runs."""
+    """Declare each option as a read-only parameter of the node with the value that is used."""
     descriptor = importlib.import_module("rcl_interfaces.msg").ParameterDescriptor
     for each in fields(options):
         if node.has_parameter(each.name):
@@ -74,7 +77,7 @@ def _declare(node: Any, options: BridgeOptions) -> None:
 
 
 async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
-    """Bridge until a signal; the exit code is 0."""
+    """Run the bridge until a signal; return the exit code 0."""
     ended = end_by_signal()
     publishers = publishers_of(node, options)
 
@@ -99,7 +102,10 @@ async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
 
 
 def publishers_of(node: Any, options: BridgeOptions) -> dict[str, Any]:
-    """Return a publisher for each topic; one whose type is not installed is left out, and said."""
+    """Return a publisher for each topic of the bridge, by the topic's name.
+
+    A topic whose message type is not installed is left out, and a line about it is printed.
+    """
     publishers = {}
     for topic, kind, latched in advertised(options):
         try:
@@ -110,7 +116,10 @@ def publishers_of(node: Any, options: BridgeOptions) -> dict[str, Any]:
 
 
 def _offer(node: Any, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:
-    """Offer the triggers of a bridge; a service with a payload needs an interface that a workspace builds."""
+    """Offer the ROS services of the bridge that have no request.
+
+    The service ``call`` is not offered: its type would have to be built in a ROS 2 workspace.
+    """
     trigger = importlib.import_module("std_srvs.srv").Trigger
 
     def answered(ask: Callable[[], Coroutine[Any, Any, CallReply]], _: Any, answer: Any) -> Any:
@@ -123,7 +132,11 @@ def _offer(node: Any, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:
 
 
 def _class_of(kind: str) -> Any:
-    """Return the class of a type such as ``sensor_msgs/msg/Image``."""
+    """Return the class of the message type *kind*, such as ``sensor_msgs/msg/Image``.
+
+    Raises:
+        UsageError: Its package is not installed.
+    """
     package, _, name = kind.partition("/msg/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
@@ -134,7 +147,11 @@ def _class_of(kind: str) -> Any:
 
 
 def _quality(*, depth: int = 10, sensor: bool = False, kept: bool = False) -> Any:
-    """Return the quality of service: images best effort, the newest; what is published is reliable."""
+    """Return a quality of service with a queue of *depth* messages.
+
+    *sensor* makes a subscription best effort, otherwise delivery is reliable; *kept* sends the last message
+    to late subscribers, and its queue has one message.
+    """
     qos = importlib.import_module("rclpy.qos")
     return qos.QoSProfile(
         depth=1 if kept else depth,

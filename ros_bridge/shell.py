@@ -1,4 +1,4 @@
-"""What the shells share: the topics that they take, and how a bridge runs until a signal ends it."""
+"""Functions for both shells: the topics to subscribe to, and the loop that runs a bridge until a signal."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from rse_pf.terminal import show
 __all__ = ["end_by_signal", "queue_of", "run_until", "taken"]
 
 _ROLES: tuple[Role, ...] = ("info", "right_info", "imu", "right", "depth", "colour")
+# Length of the subscriber's queue of an IMU: half a second at 2 kHz.
 _IMU_SAMPLES = 1000
 
 
 def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
-    """Return role, name and type of each topic that is subscribed to, the camera first."""
+    """Return role, name and type of each topic that the bridge subscribes to; camera_infos come first."""
     left_out = {"depth", "right"} - {options.partner}
     topics = ((role, str(getattr(options, role))) for role in _ROLES if role not in left_out)
     return [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
 
 
 def queue_of(role: Role, options: BridgeOptions) -> int:
-    """Return how many messages of a topic wait: of an IMU, those of half a second at 2 kHz."""
+    """Return the length of the subscriber's queue for the topic *role*."""
     return _IMU_SAMPLES if role == "imu" else options.queue_frames
 
 
 def end_by_signal() -> asyncio.Event:
-    """Return an event that SIGINT and SIGTERM set; in the main thread, with a running loop."""
+    """Return an event that SIGINT and SIGTERM set; call this in the main thread, in a running event loop."""
     ended, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
@@ -38,7 +39,10 @@ def end_by_signal() -> asyncio.Event:
 
 
 async def run_until(bridge: Bridge, options: BridgeOptions, ended: asyncio.Event) -> None:
-    """Run a bridge until *ended* is set, or it fails; say what it takes, and what it did."""
+    """Run *bridge* until *ended* is set; print the topics first, and the number of frames at the end.
+
+    An error of the bridge is raised.
+    """
     show(f"bridging {options.named(options.colour)} to {options.named('rse_pf/pose')}")
     running, waiting = asyncio.create_task(bridge.run()), asyncio.create_task(ended.wait())
     await asyncio.wait([running, waiting], return_when=asyncio.FIRST_COMPLETED)

@@ -1,6 +1,6 @@
 """Start the bridge in ROS 2: ros2 launch rse_pf_bridge/launch/bridge_launch.py url:=... token_file:=...
 
-Not yet run: no ros2 launch was at hand.
+This file was never run, because no ``ros2 launch`` was available.
 """
 
 import sys
@@ -30,7 +30,7 @@ ARGUMENTS = {
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the bridge with its arguments; python is that of the environment with rse-pf[ros]."""
+    """Return the launch of the bridge: its arguments, and the process of the Python that has rse-pf[ros]."""
     options = [
         word for name in ARGUMENTS for word in (f"--{name.replace('_', '-')}", LaunchConfiguration(name))
     ]
