@@ -217,7 +217,7 @@ class Bridge:
             self._cloud = asyncio.create_task(self._publish_cloud(images.stamp_ns))
 
     def _publish_imu_pose(self, images: PairedImages) -> None:
-        """Publish the IMU's pose in the camera frame once, when it and the name of the IMU's frame are known."""
+        """Publish the IMU's pose in the camera frame once, when it and the IMU's frame name are known."""
         rig = self._incoming.rig
         T = rig.T_camera_imu
         if self._publishes_imu and rig.imu_frame and T is not None:

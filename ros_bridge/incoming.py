@@ -373,7 +373,7 @@ class IncomingFrames:
             self._cameras.append(_StatedCamera(_stamp_ns(message), lens, first.camera, rectifier, change))
 
     def _check(self, role: Role, message: Any) -> None:
-        """Raise BrokenMessage if an image is incomplete, or its format is not that of the topic's first one."""
+        """Raise BrokenMessage if an image is incomplete, or differs in format from the topic's first one."""
         if role not in self._formats:
             image_format = format_of(message, self._kinds[role])
             wanted = "depth" if role == "depth" else "colour"

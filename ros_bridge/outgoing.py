@@ -168,7 +168,7 @@ class OutgoingMessages:
     def cloud(
         self, stamp_ns: int, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]
     ) -> list[Message]:
-        """Return the message with the cloud in the odometry frame: *points* ``(n, 3)`` (m), RGB ``(n, 3)``."""
+        """Return the cloud message in the odometry frame: *points* ``(n, 3)`` (m), RGB ``(n, 3)``."""
         made = self._maker.cloud(stamp_ns, self._options.own_odom_frame, points, colours)
         return [self._message("rse_pf/cloud", POINT_CLOUD, made)]
 

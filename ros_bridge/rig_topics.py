@@ -66,15 +66,15 @@ class RigTopics:
 
     @property
     def T_camera_imu(self) -> Array | None:
-        """The pose ``(4, 4)`` of the IMU in the frame of that camera; None if the rig does not state it."""
+        """The pose ``(4, 4)`` of the IMU in the (rectified left) camera frame; None if it is not known."""
         rig, T = self._rig, self.T_body_camera
         return None if rig is None or rig.imu is None or T is None else inverse(T) @ rig.imu.T_body_imu
 
     def learn(self, role: str, message: Any) -> None:
         """Store the ``CameraInfo`` *message* of the camera *role*.
 
-        With that of both cameras, make the rectification.
-        Later messages, and those of a bridge without a pair, are ignored.
+        Once those of both cameras are stored, the rectification of the pair is computed.  Later messages, and
+        messages of a bridge without a pair, are ignored.
 
         Raises:
             UsageError: The pair cannot be used: the cameras are swapped, or their distance is not known.

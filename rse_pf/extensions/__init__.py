@@ -1,6 +1,6 @@
-"""Extensions: what the platform works without.  They import the core; the core imports none of them.
+"""Extensions: packages that the platform does not need.  They import the core; the core imports none of them.
 
-Experiments, load generators and injected faults, recording and replay of messages, the check of drives, the
-fleet page, exports of maps, rosbridge, estimates of cost, and jobs on a cluster of Dask.  A verb of an
-extension is its ``command``.
+They are experiments with load generator and fault injection, recording and replay of messages, the check of
+drives, the fleet page, exports of maps, the rosbridge server, estimates of cost, and merges on a Dask
+cluster.  The module ``command`` of an extension defines its verb of the command line.
 """

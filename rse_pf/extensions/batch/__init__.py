@@ -1,6 +1,6 @@
-"""Work that outgrows a process: a merge cut into parts, which several processes or machines compute.
+"""Merges of maps that are too large for one process: they are cut into parts, computed by several processes.
 
-A part is named by the digest of what it computes from, and its result is kept in the store under this name.
-So a part is computed once, whatever is killed meanwhile, and by any process with the same result.  What a
-part computes belongs to `rse_pf.services`; long commands of robots belong to `rse_pf.server.jobs`.
+The name of a part is a hash of its inputs and arguments, and its result is stored under this name.  Every
+process computes the same result for a part, and a part whose result is stored is never computed again, also
+after a process was killed.  Long commands of robots are not parts; they belong to `rse_pf.server.jobs`.
 """

@@ -1,8 +1,9 @@
-"""The engine of parts on Dask: with processes of its own on this machine, or a scheduler that runs already.
+"""The engine that computes parts on Dask: with child processes on this machine, or with a running scheduler.
 
-Dask carries settings, and the names and arguments of parts.  A worker of its own that ends is replaced, and
-its part is given to another; a scheduler that is lost is started or connected again, and the parts that are
-not stored yet are handed to it.
+Dask transports the settings, and the names and arguments of parts; inputs and results are in the object
+store.  If a worker process of this machine exits, it is replaced and Dask gives its part to another worker.
+If the scheduler exits or cannot be reached, it is started or connected again, and gets the parts that are not
+stored yet.
 """
 
 from __future__ import annotations
@@ -41,33 +42,42 @@ __all__ = [
 ]
 
 PART_TRIES = 3
-"""A part whose workers ended this often is not tried again; with ``--scheduler`` Dask's own limit counts."""
+"""A part fails after this many workers have exited while they computed it.
+
+With ``--scheduler`` the limit of that
+scheduler applies."""
+# Largest number of times that the connection to a scheduler is restored, or the scheduler restarted, in a
+# run.
 _SCHEDULER_RESTARTS = 3
-"""How often a lost scheduler is started again."""
+# Time limit for the start of a scheduler, for a connection to it, and for the result of a finished part, in
+# seconds.
 _START_TIMEOUT_S = 60.0
+# Time limit for a running scheduler to answer, and then to have a worker, in seconds.
 _REMOTE_TIMEOUT_S = 10.0
-"""A scheduler that runs already has to answer, and to have a worker, within this."""
 _ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?[^\s:/]+(?::[^\s:/]+)*:\d{1,5}")
+# Time between two checks of scheduler and workers while parts are computed, in seconds.
 _POLL_S = 0.2
+# Dask's settings in the environment of scheduler and workers.
 _DASK = {
     "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "10s",
     "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "100",
     "DASK_LOGGING__DISTRIBUTED": "critical",
 }
+# Largest number of workers that are replaced in a run; with more, the machine cannot run them, and the run
+# fails.
 _MAX_WORKER_STARTS = 20
-"""Of all workers of one run, beyond their number: a machine on which they cannot live ends the run."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClusterKey:
-    """Certificate and key (PEM) of one cluster; anybody who has them may run code in it."""
+    """Certificate and key (PEM) of one cluster; every process that has them may run code in the cluster."""
 
     certificate: str
     key: str
 
 
 def new_cluster_key() -> ClusterKey:
-    """Return a new certificate and key for one run; raises MissingExtra."""
+    """Return a new certificate and key for one run; raises MissingExtra if Dask is not installed."""
     try:
         from distributed.security import Security
     except ImportError as error:
@@ -77,34 +87,37 @@ def new_cluster_key() -> ClusterKey:
 
 
 class Cluster(Protocol):
-    """A scheduler with workers."""
+    """A Dask scheduler with workers; ``address`` is that of the scheduler."""
 
     address: str
 
     @property
     def is_lost(self) -> bool:
-        """Whether the scheduler has ended, as far as this process knows."""
+        """Whether the scheduler has exited, as far as this process knows."""
 
     def start(self) -> None:
-        """Start it, or check that it runs; raises RsePfError."""
+        """Start scheduler and workers, or check that they run; raises RsePfError if they do not."""
 
     def replace_dead_workers(self) -> int:
-        """Start a worker for each one that ended; return how many."""
+        """Start a new worker for each worker that has exited; return the number of new workers."""
 
     def stop(self) -> None:
-        """End what `start` started."""
+        """Stop the processes that `start` started."""
 
     def security(self) -> Any:
-        """Return Dask's TLS for a client; None for what Dask is configured with."""
+        """Return Dask's Security for a client; None for that of Dask's configuration."""
 
 
 class RemoteCluster:
-    """A scheduler and workers that somebody else has started; TLS is that of Dask's configuration."""
+    """A running scheduler with its workers, which this process neither starts nor stops.
+
+    TLS is that of Dask's configuration.
+    """
 
     is_lost = False
 
     def __init__(self, address: str) -> None:
-        """Connect to nothing yet; raises UsageError if *address* is none of a scheduler."""
+        """Describe the cluster; raises UsageError if *address* is not the address of a scheduler."""
         if _ADDRESS.fullmatch(address) is None:
             raise UsageError(
                 f"{address[:80]!r} is no address of a Dask scheduler",
@@ -113,7 +126,12 @@ class RemoteCluster:
         self.address = address if "://" in address else f"tcp://{address}"
 
     def start(self) -> None:
-        """Check that the scheduler answers and has a worker; raises Disconnected or ConfigurationError."""
+        """Check that the scheduler answers, has a worker, and runs this version of rse-pf.
+
+        Raises:
+            Disconnected: It does not answer within 10 s, or has no worker after another 10 s.
+            ConfigurationError: A certificate is missing, or a process has another version of rse-pf.
+        """
         from distributed import Client
         from distributed.security import Security
 
@@ -143,25 +161,25 @@ class RemoteCluster:
             client.close(timeout=1)
 
     def replace_dead_workers(self) -> int:
-        """Replace none: who started the workers looks after them."""
+        """Return 0: the workers of a remote cluster are not replaced."""
         return 0
 
     def stop(self) -> None:
-        """Stop nothing."""
+        """Do nothing: this process started no process of the cluster."""
 
     def security(self) -> None:
-        """Leave TLS to Dask's configuration."""
+        """Return None: TLS is that of Dask's configuration."""
 
 
 class LocalCluster:
-    """A scheduler and workers as child processes of this one; they end with it."""
+    """A scheduler and workers that are child processes of this process, and exit with it."""
 
     def __init__(self, workers: int, *, part_tries: int = PART_TRIES) -> None:
-        """Start nothing yet.
+        """Describe the cluster; no process is started.
 
         Args:
             workers: Number of worker processes.
-            part_tries: A part whose workers ended this often is not tried again.
+            part_tries: A part fails after this many workers have exited while they computed it.
         """
         self.address = ""
         self._key = new_cluster_key()
@@ -180,26 +198,30 @@ class LocalCluster:
 
     @property
     def worker_pids(self) -> list[int]:
-        """Return the pids of the workers of this machine."""
+        """Return the pids of the workers, including those that have exited and are not yet replaced."""
         return [each.pid for each in self._workers]
 
     @property
     def is_lost(self) -> bool:
-        """Whether the scheduler has ended."""
+        """Whether the scheduler has exited or was not started."""
         return self._scheduler is None or self._scheduler.exit_code() is not None
 
     def start(self) -> None:
-        """Start scheduler and workers; raises Crashed if the scheduler does not come up."""
+        """Stop running processes, then start scheduler and workers.
+
+        Raises:
+            Crashed: The scheduler did not report its address within 60 s.
+        """
         self.stop()
         self._scheduler = self._spawn("scheduler", "")
         self.address = _address(self._scheduler, _START_TIMEOUT_S)
         self._workers = [self._start_worker() for _ in range(self._count)]
 
     def replace_dead_workers(self) -> int:
-        """Start a worker for each one that ended; return how many.
+        """Start a new worker for each worker that has exited; return the number of new workers.
 
         Raises:
-            Crashed: Too many have ended.
+            Crashed: More than 20 workers have exited in this run.
         """
         dead = [row for row, each in enumerate(self._workers) if each.exit_code() is not None]
         for row in dead:
@@ -214,13 +236,13 @@ class LocalCluster:
         return len(dead)
 
     def stop(self) -> None:
-        """Kill all processes and wait for them."""
+        """Kill scheduler and workers, and wait until they have exited."""
         for each in [*self._workers, *([self._scheduler] if self._scheduler is not None else [])]:
             each.kill()
         self._workers, self._scheduler = [], None
 
     def security(self) -> Any:
-        """Return the TLS of the cluster's key."""
+        """Return Dask's Security with the certificate and key of this cluster."""
         return security_of(self._key.certificate, self._key.key)
 
     def _start_worker(self) -> Child:
@@ -237,7 +259,7 @@ class LocalCluster:
 
 
 class DaskEngine:
-    """Computes parts by the workers of a cluster."""
+    """Computes parts by the workers of a cluster, and restarts the cluster's scheduler if it is lost."""
 
     def __init__(
         self,
@@ -247,13 +269,13 @@ class DaskEngine:
         *,
         on_event: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Connect to nothing yet.
+        """Describe the engine; nothing is started or connected.
 
         Args:
-            store: The same as that of ``settings.data.store``, which the workers open.
-            settings: Sent to the workers.
-            cluster: Started, but not stopped, by this engine.
-            on_event: Called with one line when a worker or a scheduler was replaced.
+            store: The object store of ``settings.data.store``, which the workers open as well.
+            settings: The settings that are sent to the workers.
+            cluster: The cluster; this engine starts it, but does not stop it.
+            on_event: Called with one line of text when a worker or the scheduler was replaced.
         """
         self._store = store
         self._settings = msgspec.json.encode(settings.to_dict())
@@ -263,16 +285,18 @@ class DaskEngine:
         self._restarts = 0
 
     def start(self) -> None:
-        """Start the cluster; raises RsePfError if it does not come up."""
+        """Start the cluster; raises RsePfError if it does not start."""
         self._cluster.start()
 
     def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
-        """Compute *parts*.
+        """Compute *parts*, whose results are in the store afterwards.
+
+        Call *on_done* with the number computed so far.
 
         Raises:
-            Disconnected: The scheduler ended too often.
-            Crashed: A part ended its workers, or workers could not live.
-            RsePfError: A part failed.
+            Disconnected: The scheduler was lost more than three times.
+            Crashed: Too many workers exited, during one part or in the whole run.
+            RsePfError: The computation of a part failed.
         """
         done: set[str] = set()
         while len(done) < len({part.name for part in parts}):
@@ -288,7 +312,7 @@ class DaskEngine:
                 on_done(len(done))
 
     def close(self) -> None:
-        """Disconnect from the scheduler."""
+        """Disconnect from the scheduler; errors are ignored."""
         client, self._client = self._client, None
         if client is not None:
             with contextlib.suppress(Exception):
@@ -309,7 +333,12 @@ class DaskEngine:
             raise _SchedulerLost from error
 
     def _computed(self, parts: Sequence[Part]) -> Iterator[str]:
-        """Hand out *parts* and yield the name of each when it is done."""
+        """Submit *parts* to the scheduler, and yield the name of each part once it is computed.
+
+        Raises:
+            _SchedulerLost: The scheduler exited or cannot be reached.
+            RsePfError: The computation of a part failed, or its workers exited.
+        """
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         futures: dict[str, Any] = {}
         try:
@@ -320,7 +349,7 @@ class DaskEngine:
             for future in futures.values():
                 future.add_done_callback(ended.put)
             while futures:
-                self._look_after()
+                self._check_cluster()
                 try:
                     future = ended.get(timeout=_POLL_S)
                 except queue.Empty:
@@ -335,7 +364,7 @@ class DaskEngine:
             raise _SchedulerLost from error
 
     def _answer_of(self, future: Any) -> list[str]:
-        """Return what `compute` returned; raises Crashed if the part ended its workers."""
+        """Return the result of `compute` for a part; raises Crashed if too many workers exited during it."""
         from distributed.scheduler import KilledWorker
 
         try:
@@ -347,7 +376,7 @@ class DaskEngine:
             ) from error
         return answer
 
-    def _look_after(self) -> None:
+    def _check_cluster(self) -> None:
         if self._cluster.is_lost:
             raise _SchedulerLost
         replaced = self._cluster.replace_dead_workers()
@@ -366,7 +395,10 @@ class DaskEngine:
 
 
 def _check_versions(about: Mapping[str, Any]) -> None:
-    """Raise ConfigurationError if the scheduler or a worker cannot load what this process sends."""
+    """Raise ConfigurationError if scheduler or a worker has another version of rse-pf than this process.
+
+    *about* is the result of Dask's ``Client.get_versions``.
+    """
     ours = about["client"]["packages"]["rse_pf"]
     for address, process in {"the Dask scheduler": about["scheduler"], **about["workers"]}.items():
         theirs = process["packages"].get("rse_pf")
@@ -379,18 +411,18 @@ def _check_versions(about: Mapping[str, Any]) -> None:
 
 
 def _silence() -> None:
-    """Keep what Dask logs about lost connections from the terminal: the engine says what happened."""
+    """Disable the loggers of Dask, since the engine itself reports lost connections."""
     names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
     for name in [*names, "distributed", "tornado", "asyncio"]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 class _SchedulerLost(Exception):
-    """The scheduler does not answer any more."""
+    """The scheduler has exited or does not answer."""
 
 
 def _address(scheduler: Child, timeout_s: float) -> str:
-    """Return the address that *scheduler* tells; raises Crashed."""
+    """Return the address that the process *scheduler* sends; raises Crashed if it exits or takes too long."""
     try:
         address: str | None = receive(scheduler.connection, time.monotonic() + timeout_s)
     except TimeoutError:

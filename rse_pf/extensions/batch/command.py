@@ -29,13 +29,15 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
 
-_WORKERS = 2  # worker processes without --workers: a laptop stays usable
-_MAX_WORKERS = 64  # each takes some 200 MB, so that more are a mistake
+# Default of --workers: so few worker processes that a laptop can still be used.
+_WORKERS = 2
+# Largest --workers: a worker takes about 200 MB of memory, so that a larger number is a mistake.
+_MAX_WORKERS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class CleanRequest:
-    """The store whose unfinished parts are deleted."""
+    """Options of ``rse-pf batch clean``: the store from which the parts of all merges are deleted."""
 
     store: str | None = option(
         "--store",
@@ -43,7 +45,11 @@ class CleanRequest:
     )
 
     def settings_with_store(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return the settings with the store of the request, as workers find it; raises UsageError."""
+        """Return *settings* with the store of the request; a folder as absolute path, since workers open it.
+
+        Raises:
+            UsageError: The store cannot be used.
+        """
         chosen = with_store(self.store, settings)
         kind, _, path = chosen.data.store.partition(":")
         return chosen.replace(data={"store": f"dir:{os.path.abspath(path)}"}) if kind == "dir" else chosen
@@ -51,7 +57,7 @@ class CleanRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class MergeInPartsRequest(CleanRequest):
-    """Maps that are merged in parts, and the workers that compute the parts."""
+    """Options of ``rse-pf batch run merge``: the maps to merge, and the workers that compute the parts."""
 
     names: tuple[str, ...] = option(
         nargs="+",
@@ -82,7 +88,7 @@ class MergeInPartsRequest(CleanRequest):
 
 
 def merge_in_parts(request: MergeInPartsRequest, settings: PlatformSettings) -> int:
-    """Merge maps in parts; the exit code is 1 if a map was not joined."""
+    """Merge maps in parts and commit the merged map; return 1 if a map was not joined, else 0."""
     settings = request.settings_with_store(settings)
     require("batch run")
     from rse_pf.extensions.batch.cluster import Cluster, DaskEngine, LocalCluster, RemoteCluster
@@ -140,7 +146,7 @@ def merge_in_parts(request: MergeInPartsRequest, settings: PlatformSettings) -> 
 
 
 def delete_parts(request: CleanRequest, settings: PlatformSettings) -> None:
-    """Delete the parts of merges that were not finished."""
+    """Delete the stored parts of all merges, also of running ones, and print the number of objects."""
     from rse_pf.extensions.batch.parts import PREFIX
 
     store = open_data_store(request.settings_with_store(settings))

@@ -1,7 +1,8 @@
-"""Align the clouds of two maps tile by tile, and turn each alignment into a link between two keyframes.
+"""Align the point clouds of two maps tile by tile with ICP, and make a loop closure of each alignment.
 
-A tile is a cube of the first map's world in which both maps have points.  Tiles are aligned apart from each
-other, because two clouds of drifted maps do not fit as a whole.  Deterministic.
+A tile is a cube of the first map's world frame in which both maps have points.  Each tile is aligned on its
+own, because the maps have drifted, so that no single rigid transform fits their whole clouds.  The result is
+deterministic.
 """
 
 from __future__ import annotations
@@ -27,21 +28,24 @@ Rows = npt.NDArray[np.int64]
 Points = npt.NDArray[np.floating[Any]]
 
 TILE_M = 3.0
+"""Side of a tile, in metres."""
+# Largest number of tiles of two maps that are aligned: those with the most points.
 _MAX_TILES = 6
-"""Of two maps; those with most points are taken."""
+# Smallest number of points that each of the two clouds must have in a tile.
 _MIN_POINTS = 2000
-"""Of each of the two clouds in a tile."""
 
 
 def align_tiles(
     atlas: Atlas, clouds: tuple[Points, Points], T_one_other: Array
 ) -> tuple[list[LoopClosure], Counter[str]]:
-    """Return a link for each tile that could be aligned, and why others were refused.
+    """Return a loop closure for each tile that was aligned, and counts of the other tiles by reason.
+
+    A loop closure is between the keyframes of both maps that observed the tile best.
 
     Args:
-        atlas: The keyframes of the two maps; links have its rows.
-        clouds: ``(n, 3)`` and ``(m, 3)``, metres, each in the world of its map.
-        T_one_other: ``(4, 4)``, where the second map is in the first one.
+        atlas: The keyframes of the two maps; loop closures refer to its rows.
+        clouds: ``(n, 3)`` and ``(m, 3)``, metres, each in the world frame of its map.
+        T_one_other: ``(4, 4)``, initial pose of the second map in the first one.
     """
     target, source = (np.asarray(cloud, dtype=np.float64) for cloud in clouds)
     links: list[LoopClosure] = []
@@ -72,7 +76,10 @@ def align_tiles(
 
 
 def _tiles(target: Array, moved: Array) -> list[Array]:
-    """Return the lower corners of the tiles with most points of both clouds, in the order of space."""
+    """Return the lower corners ``(3,)`` of at most `_MAX_TILES` tiles with enough points, sorted by position.
+
+    Tiles are chosen by the smaller of the two clouds' numbers of points.
+    """
     counts = []
     for cloud in (target, moved):
         numbers, count = np.unique(np.floor(cloud / TILE_M).astype(np.int64), axis=0, return_counts=True)
@@ -92,6 +99,6 @@ def _within(cloud: Array, low: Array, size_m: float) -> Mask:
 
 
 def _observer(atlas: Atlas, rows: Rows, point: Array) -> int:
-    """Return the row of the keyframe that saw *point* best."""
+    """Return which of *rows* is the keyframe that observed *point* ``(3,)`` best."""
     place = find_observers(point[None], [atlas.keyframes[row] for row in rows.tolist()])[0]
     return int(rows[place])

@@ -1,6 +1,7 @@
-"""How the processes of a cluster listen: on one address, with TLS, for who shows the cluster's certificate.
+"""Close two gaps in the listening sockets of Dask's scheduler and workers.
 
-Dask opens a page over HTTP in each process, without TLS or token, and waits for ever for a handshake.
+Dask opens an HTTP page in each process, without TLS or token: `without_pages` removes it.  Dask also waits
+without a time limit for the handshake of a new connection: `bound_handshakes` adds a limit.
 """
 
 from __future__ import annotations
@@ -12,21 +13,27 @@ from rse_pf.http.unauthenticated import SilentConnections
 
 __all__ = ["bound_handshakes", "without_pages"]
 
-_MAX_SILENT, _MAX_PER_SOURCE = 128, 64
+# Largest number of connections whose handshakes are not finished, of all addresses.
+_MAX_SILENT = 128
+# Largest number of connections whose handshakes are not finished, of one address.
+_MAX_PER_SOURCE = 64
 
 
 def without_pages(kind: Any) -> Any:
-    """Return the class *kind*, a Scheduler or a Worker of Dask, without its port for HTTP."""
+    """Return a subclass of *kind*, Dask's Scheduler or Worker, that opens no HTTP port."""
     return type(kind.__name__, (kind,), {"start_http_server": lambda *_, **__: None})
 
 
 def bound_handshakes() -> None:
-    """Let every listener that Dask opens from now on cut connections that do not shake hands in time."""
+    """Let all TLS listeners that Dask opens from now on close connections with unfinished handshakes.
+
+    Dask's registry of listeners is changed for the whole process.
+    """
     from distributed.comm.registry import backends
     from distributed.comm.tcp import TLSListener
 
     class Listener(TLSListener):  # type: ignore[misc]
-        """Counts a connection until both handshakes, of TLS and of Dask, are done."""
+        """A TLS listener that limits connections whose handshakes (TLS, then Dask's) are not finished."""
 
         async def start(self) -> None:
             later = asyncio.get_running_loop().call_later

@@ -1,7 +1,7 @@
-"""Merge maps in parts: the steps of `merge_versions` that take long are cut up and handed to an engine.
+"""Merge maps in parts: the expensive steps of `merge_versions` are cut into parts that an engine computes.
 
-Everything else is that function itself, so that both give the same links and the same map.  A run that was
-killed is continued by the same call: parts that were finished are not computed again.
+All other steps are those of `merge_versions`, so that both give the same loop closures and the same map.  A
+run that was killed is continued by the same call: parts whose results are stored are not computed again.
 """
 
 from __future__ import annotations
@@ -41,43 +41,49 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 
+# Progress, as a fraction of the whole merge, at which each kind of part begins.
 _SHARES = {
     "vectors": 0.0, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
     "optimise": 0.88, "cloud": 0.95,
 }  # fmt: skip
-"""Where the bar of progress stands when a step begins."""
+# Each kind of part in the text of the progress.
 _DOING = {
     "vectors": "views of maps", "pairs": "proposals", "links": "parts of links",
     "agree": "pairs of maps", "tiles": "pairs of clouds", "optimise": "pose graphs", "cloud": "clouds",
 }  # fmt: skip
 MAX_MAPS = 256
+"""Largest number of maps of one merge."""
 MAX_KEYFRAMES = 20_000
-"""Keyframes of all maps of one merge: as many as the largest stored map holds."""
+"""Largest number of keyframes of all maps of one merge, as many as the largest stored map holds."""
 MAX_LINKS_PER_PAIR = 300
-"""Measured links of two maps, or within one, that are compared with each other, the best of each keyframe
-first.  The cost of comparing grows with the cube: 215 links take 0.4 s."""
+"""Largest number of loop closures of two maps, or of one map, that are checked for pairwise consistency.
+The best of each keyframe are taken first.  The time grows with the cube of the number: 215 take 0.4 s."""
 MAX_LINKS = 30_000
-"""Links of a merged map; where more agree, each pair of maps keeps its strongest.  A map holds 100,000 edges,
-and 24,701 take 16.5 s to optimise."""
+"""Largest number of loop closures in a merged map.
+
+Of more, the strongest of each pair of maps are used.  A map may
+hold 100,000 edges, and 24,701 take 16.5 s to optimise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchMergeResult:
-    """The merged map, what is known about its links, and how many parts were computed or found."""
+    """The merged map, its loop closures, and the numbers and times of its parts."""
 
     merged: MergedMap
     links: tuple[LoopClosure, ...]
-    """All that PnP measured."""
+    """All loop closures that PnP measured, accepted or not."""
     tiles: tuple[LoopClosure, ...]
-    """Those that the alignment of clouds added."""
+    """Loop closures from the alignment of clouds."""
     computed: int
+    """Number of parts that this run computed."""
     found: int
+    """Number of parts whose results were stored already."""
     seconds: Mapping[str, float]
-    """Time of each kind of part."""
+    """Wall-clock time of each kind of part, in seconds."""
 
 
 class BatchMerge:
-    """One merge in parts."""
+    """One merge of maps in parts; `run` merges, `forget` deletes the parts afterwards."""
 
     def __init__(
         self,
@@ -89,15 +95,16 @@ class BatchMerge:
         align_clouds: bool = True,
         two_levels: bool = True,
     ) -> None:
-        """Compute nothing yet.
+        """Describe the merge; nothing is computed.
 
         Args:
-            store: Holds the maps, the parts and their results; everybody who computes reaches it.
+            store: The object store with the maps and the results of parts; every worker must have access to
+                it.
             engine: Computes the parts.
-            settings: Limits of maps and the size of parts.
-            options: How to merge; None means the defaults.
-            align_clouds: Whether overlapping clouds are aligned, too.
-            two_levels: Whether each map's pose graph is optimised by itself before the whole one.
+            settings: Settings of the platform, with the size of parts (``batch.pairs_per_part``).
+            options: Options of the merge; None means the defaults.
+            align_clouds: Whether overlapping clouds are aligned, which gives more loop closures.
+            two_levels: Whether the pose graph of each map is optimised on its own before the whole graph.
         """
         self._store = store
         self._engine = engine
@@ -114,19 +121,19 @@ class BatchMerge:
         self._agreeing: list[Part] = []
         self._pairs: list[tuple[int, int]] = []
         self._computed = self._found = 0
-        self._share = 0.0
+        self._progress = 0.0
 
     def run(self, maps: Sequence[str], report: Report = ignore_progress) -> BatchMergeResult:
-        """Merge the objects *maps*, encoded map versions whose names have their digests.
+        """Merge the maps in the objects *maps* and return the result.
 
         Args:
-            maps: Names of the objects.
-            report: Called with the progress; may raise Cancelled.
+            maps: Names of objects with encoded map versions; a name contains the digest of the object.
+            report: Called with the completed fraction and a text; may raise Cancelled.
 
         Raises:
-            BadRequest: An object is no map, or has no keyframes.
-            LimitExceeded: The maps are too many or too large.
-            RsePfError: Those who compute are gone, or a part failed; the same call continues.
+            BadRequest: The number of maps is out of range, or an object is no map or has no keyframes.
+            LimitExceeded: The maps have too many keyframes or features.
+            RsePfError: The workers cannot be reached, or a part failed; the same call continues the merge.
         """
         self._maps = tuple(maps)
         self._report = report
@@ -142,7 +149,7 @@ class BatchMerge:
         )  # fmt: skip
 
     def forget(self) -> None:
-        """Delete the results of all parts from the store."""
+        """Delete the results and inputs of all parts of this merge from the store."""
         delete_parts(self._store, self._own)
 
     def _versions(self) -> list[MapVersion]:
@@ -167,12 +174,15 @@ class BatchMerge:
         return versions
 
     def _whole_report(self, done: float, what: str) -> None:
-        """Report what `merge_versions` says only at its end: its steps report themselves."""
+        """Pass on only the last report of `merge_versions`: during its steps, `_run` reports the progress."""
         if done >= 1.0:
             self._report(done, what)
 
     def _run(self, parts: Sequence[Part]) -> list[PartResult]:
-        """Compute those of *parts*, all of one kind, that are not stored; return the results of all."""
+        """Compute those of *parts* whose results are not stored; return the results of all, in their order.
+
+        All parts must be of the same kind.
+        """
         if not parts:
             return []
         kind = parts[0].kind
@@ -183,8 +193,9 @@ class BatchMerge:
 
         def on_done(count: int) -> None:
             share = (known + count) / len(parts)
-            self._share = max(self._share, begin + share * (end - begin))  # pose graphs come three times
-            self._report(self._share, f"{known + count} of {len(parts)} {_DOING[kind]}")
+            # Pose graphs are computed in three rounds: the progress must not go back with each.
+            self._progress = max(self._progress, begin + share * (end - begin))
+            self._report(self._progress, f"{known + count} of {len(parts)} {_DOING[kind]}")
 
         on_done(0)
         self._own += [part.name for part in parts]
@@ -360,9 +371,10 @@ class BatchMerge:
 def strongest(
     atlas: Atlas, links: Sequence[LoopClosure], most: int
 ) -> tuple[list[LoopClosure], RejectionCounts]:
-    """Return at most about *most* of *links*: of each pair of maps the best of its keyframes, in their order.
+    """Return about *most* of *links* at most, in their order, and counts of the dropped ones by pair of maps.
 
-    Every pair keeps the same number, or all that it has, so that no map loses its connection.
+    Each pair of maps keeps the same number of links, at least one, or all if it has fewer, so that no map
+    loses its connection.  Of a pair, the best links of each keyframe are kept first.
     """
     refused: RejectionCounts = Counter()
     if len(links) <= most:
@@ -380,7 +392,10 @@ def strongest(
 
 
 def _moved(link: LoopClosure, pair: tuple[int, int], starts: npt.NDArray[np.int64]) -> LoopClosure:
-    """Return *link* with rows of the atlas of all maps, from rows of the atlas of its *pair*."""
+    """Return *link*, whose rows are those of the atlas of *pair* only, with rows of the atlas of all maps.
+
+    *starts* holds the first row of each map in the atlas of all maps, and the number of rows at the end.
+    """
     one, other = pair
     count = int(starts[one + 1] - starts[one])
 

@@ -1,9 +1,10 @@
-"""One process of a cluster of Dask: a scheduler, or a worker that computes one part at a time.
+"""One process of a local Dask cluster: the scheduler, or a worker that computes one part at a time.
 
-The order comes through the socket of the child, because it has the key of the cluster; a scheduler answers
-with its address.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
-pickled, so that anybody who may connect may run any code.  Each listens at one port, on one address.  A
-robot's bytes are never among it: a part names objects of the store, and its result is an object of the store.
+The parent sends a `NodeOrder` with the key of the cluster through the socket of the child process; a
+scheduler answers with its address.  Both use TLS only, and accept only peers with the cluster's key: Dask's
+messages are pickled, so that a peer could run any code.  Each process listens at one port of the loopback
+interface.  Dask's messages contain no bytes of robots: a part names objects of the store, and its result is
+an object of the store.
 """
 
 from __future__ import annotations
@@ -30,23 +31,26 @@ from rse_pf.terminal import show
 
 __all__ = ["NodeOrder", "compute", "run_scheduler", "run_worker", "security_of"]
 
+# Address at which scheduler and workers listen, so that only processes of this machine can connect.
 _HOST = "127.0.0.1"
-"""Where scheduler and workers of one command listen: only processes of this machine reach them."""
+# A worker without a connection to the scheduler exits after this time, in seconds.
 _DEATH_TIMEOUT_S = 20.0
-"""A worker that finds no scheduler ends after this."""
 
 
 class NodeOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """What a process of a cluster is told: the cluster's key and certificate (PEM), and where to connect."""
+    """The message to a new process of a cluster: certificate and key of the cluster, both PEM."""
 
     certificate: str
     key: str
     address: str = ""
-    """Of the scheduler that a worker joins."""
+    """Address of the scheduler to which a worker connects; empty for a scheduler."""
 
 
 def security_of(certificate: str, key: str) -> Any:
-    """Return Dask's TLS for a cluster with one certificate, which everybody shows and nobody else has."""
+    """Return Dask's Security for a cluster whose processes all use the same certificate and *key* (PEM).
+
+    The certificate is its own authority, so that no other certificate is accepted.
+    """
     from distributed.security import Security
 
     return Security(
@@ -57,11 +61,14 @@ def security_of(certificate: str, key: str) -> Any:
 
 
 def compute(settings: bytes, part: bytes) -> list[str]:
-    """Compute a part on a worker; return an empty list, or code, message and hint of what failed.
+    """Compute a part on a worker and store its result.
+
+    Return an empty list, or code, message and hint of an error.
+    No exception is raised, since Dask would pickle it.
 
     Args:
-        settings: The platform's settings as JSON; ``data.store`` has the parts.
-        part: As `encode_part` returned it.
+        settings: The platform's settings as JSON; ``data.store`` is the store of inputs and results.
+        part: A part, encoded by `encode_part`.
     """
     try:
         compute_part(_store_of(settings), decode_part(part))
@@ -75,12 +82,12 @@ def compute(settings: bytes, part: bytes) -> list[str]:
 
 
 def run_scheduler(parent: socket.socket) -> None:
-    """Schedule until the parent is gone."""
+    """Run a Dask scheduler until the parent exits or closes the socket; entry point of the process."""
     _run(parent, functools.partial(_scheduler, parent))
 
 
 def run_worker(parent: socket.socket) -> None:
-    """Compute parts until the parent or the scheduler is gone."""
+    """Run a Dask worker until the parent or the scheduler exits; entry point of the process."""
     _run(parent, _worker)
 
 

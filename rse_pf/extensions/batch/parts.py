@@ -1,6 +1,7 @@
-"""Parts of a batch job: their names, their results as bytes, and which of them are done.
+"""The parts of a batch job: their names, their encoding, and their results in the object store.
 
-Nothing here is pickled: a part and its result are MessagePack with declared fields and arrays of known types.
+A part and its result are encoded as MessagePack with declared fields and arrays of known types, never
+pickled.
 """
 
 from __future__ import annotations
@@ -32,24 +33,31 @@ __all__ = [
 ]
 
 PREFIX = "batch"
-"""Of the names of parts and inputs in the store; no robot can name an object below it."""
+"""First part of the names of all results and inputs in the store.
+
+Robots cannot use names that begin with it.
+"""
+# Version of the computations; it must be raised when a part computes another result from the same inputs.
 _FORMAT = 1
-"""Changes when a part computes something else from the same inputs."""
+# Types of arrays in results: the kind and size in bytes of numpy, and the stored byte order.
 _TYPES = {"f8": "<f8", "f4": "<f4", "i8": "<i8", "u1": "|u1"}
 Array = npt.NDArray[Any]
 
 
 class Part(msgspec.Struct, frozen=True, kw_only=True):
-    """One unit of work: what is computed, from which objects, with which arguments."""
+    """One unit of work: the kind of its computation (a key of `tasks._KINDS`), inputs and arguments."""
 
     kind: str
     inputs: tuple[str, ...]
-    """Names of objects in the store, all of them named by their contents or by how they were computed."""
+    """Names of objects in the store.
+
+    An object never changes: its name is a hash of its content or computation.
+    """
     arguments: dict[str, Any] = {}
 
     @property
     def name(self) -> str:
-        """Return the name of the result in the store."""
+        """Return the name of the result in the store: the kind, and a hash of kind, inputs and arguments."""
         plain = msgspec.msgpack.encode(
             [_FORMAT, self.kind, self.inputs, self.arguments], order="deterministic"
         )
@@ -58,7 +66,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PartResult:
-    """Arrays by name, and how often something happened by its reason."""
+    """The result of a part: arrays by name, and counts, such as those of rejected pairs by reason."""
 
     arrays: Mapping[str, Array] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
@@ -80,7 +88,7 @@ decode_part: Callable[[bytes], Part] = msgspec.msgpack.Decoder(Part).decode
 
 
 def encode_result(result: PartResult) -> bytes:
-    """Return *result* as bytes; the same result gives the same bytes."""
+    """Return *result* as MessagePack; equal results give equal bytes."""
     arrays = {}
     for name, each in result.arrays.items():
         kind = f"{each.dtype.kind}{each.dtype.itemsize}"
@@ -90,7 +98,7 @@ def encode_result(result: PartResult) -> bytes:
 
 
 def decode_result(name: str, data: bytes) -> PartResult:
-    """Return the result in *data*, the object *name*; raises StoreError."""
+    """Return the result in *data*, the content of the object *name*; raises StoreError if it is malformed."""
     try:
         plain = msgspec.msgpack.decode(data, type=_Result)
         arrays = {
@@ -103,7 +111,7 @@ def decode_result(name: str, data: bytes) -> PartResult:
 
 
 def put_input(store: ObjectStore, result: PartResult) -> str:
-    """Store arrays that parts read, under their digest; return the name."""
+    """Store *result*, arrays that parts read as input, unless it is stored; return the object's name."""
     data = encode_result(result)
     name = f"{PREFIX}/inputs/{digest_of(data)}"
     if not _exists(store, name):
@@ -112,7 +120,7 @@ def put_input(store: ObjectStore, result: PartResult) -> str:
 
 
 def read_result(store: ObjectStore, name: str) -> PartResult:
-    """Return the result or input *name*; raises NotFound or StoreError."""
+    """Return the result or input in the object *name*; raises NotFound, or StoreError if it is malformed."""
     return decode_result(name, store.get(name))
 
 
@@ -122,7 +130,7 @@ def is_done(store: ObjectStore, part: Part) -> bool:
 
 
 def delete_parts(store: ObjectStore, names: Sequence[str]) -> None:
-    """Delete results and inputs that are no longer needed."""
+    """Delete those of the objects *names* that are results or inputs of parts; other names are ignored."""
     for name in names:
         if name.startswith(f"{PREFIX}/"):
             store.delete(name)

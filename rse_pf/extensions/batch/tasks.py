@@ -1,6 +1,7 @@
-"""What each kind of part computes: from objects of the store to one result, the same in every process.
+"""The computation of each kind of part: it reads objects of the store and returns one result.
 
-Maps are decoded here within the limits of the platform's services.
+A computation gives the same result in every process.  Maps are decoded within the limits of the platform's
+services.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ __all__ = [
     "strongest_rows",
 ]
 
+# Number of decoded maps that a process keeps in memory for the next parts.
 _CACHED_MAPS = 4
 
 
@@ -50,7 +52,7 @@ def compute_part(store: ObjectStore, part: Part) -> None:
     """Compute *part* and store its result, unless it is stored already.
 
     Raises:
-        BadRequest: There is no such kind of part, or an input is damaged.
+        BadRequest: The kind of part is unknown, or an input is malformed.
         StoreError: The store failed.
     """
     if part.kind not in _KINDS:
@@ -60,7 +62,7 @@ def compute_part(store: ObjectStore, part: Part) -> None:
 
 
 def link_arrays(links: Sequence[LoopClosure]) -> dict[str, npt.NDArray[Any]]:
-    """Return links as arrays of one row each."""
+    """Return loop closures as arrays that have a row for each of them."""
     return {
         "a": np.array([link.a for link in links], dtype=np.int64),
         "b": np.array([link.b for link in links], dtype=np.int64),
@@ -72,7 +74,7 @@ def link_arrays(links: Sequence[LoopClosure]) -> dict[str, npt.NDArray[Any]]:
 
 
 def links_of(result: PartResult) -> list[LoopClosure]:
-    """Return the links of `link_arrays`."""
+    """Return the loop closures in the arrays of *result*, which `link_arrays` made."""
     of = result.arrays
     return [
         LoopClosure(a=a, b=b, T_a_b=T, information=information, inliers=inliers, matches=matches)
@@ -84,9 +86,10 @@ def links_of(result: PartResult) -> list[LoopClosure]:
 
 
 def strongest_rows(links: Sequence[LoopClosure], most: int) -> list[int]:
-    """Return the rows of at most *most* of *links*, sorted: of each keyframe the best before its second best.
+    """Return the row numbers of at most *most* of *links*, sorted.
 
-    So they are spread over the map, and not all of the one place with most features.
+    The link with the most inliers of each keyframe comes before every keyframe's second best, so that the
+    chosen links are spread over the map.
     """
     by_inliers = sorted(range(len(links)), key=lambda row: (-links[row].inliers, row))
     seen: Counter[int] = Counter()
@@ -98,7 +101,7 @@ def strongest_rows(links: Sequence[LoopClosure], most: int) -> list[int]:
 
 
 def graph_arrays(graph: PoseGraph) -> dict[str, npt.NDArray[Any]]:
-    """Return a pose graph as arrays."""
+    """Return the poses and edges of a pose graph as arrays."""
     return {
         "poses": graph.T_world_pose, "a": graph.a, "b": graph.b, "T_a_b": graph.T_a_b,
         "information": graph.information, "robust": graph.robust.astype(np.uint8),
@@ -106,7 +109,7 @@ def graph_arrays(graph: PoseGraph) -> dict[str, npt.NDArray[Any]]:
 
 
 def graph_of(result: PartResult) -> PoseGraph:
-    """Return the pose graph of `graph_arrays`."""
+    """Return the pose graph in the arrays of *result*, which `graph_arrays` made."""
     of = result.arrays
     return PoseGraph(
         T_world_pose=of["poses"], a=of["a"], b=of["b"], T_a_b=of["T_a_b"], information=of["information"],
@@ -115,14 +118,14 @@ def graph_of(result: PartResult) -> PoseGraph:
 
 
 def _vectors(store: ObjectStore, part: Part) -> PartResult:
-    """Describe each keyframe of a map by a vector."""
+    """Compute the place-recognition vector of each keyframe of a map: array ``vectors``."""
     atlas = _atlas(store, part, 1)
     vectors = [place_vector(keyframe.descriptors) for keyframe in atlas.keyframes]
     return PartResult(arrays={"vectors": np.array(vectors, dtype=np.float32).reshape(-1, PLACE_VECTOR_SIZE)})
 
 
 def _pairs(store: ObjectStore, part: Part) -> PartResult:
-    """Propose pairs of keyframes of two maps, or of one."""
+    """Choose pairs of similar keyframes of two maps, or of one: array ``pairs`` ``(n, 2)`` of rows."""
     vectors = [read_result(store, name).arrays["vectors"] for name in part.inputs]
     of_map = np.concatenate([np.full(len(each), which) for which, each in enumerate(vectors)])
     stacked = np.concatenate(vectors)
@@ -136,7 +139,7 @@ def _pairs(store: ObjectStore, part: Part) -> PartResult:
 
 
 def _links(store: ObjectStore, part: Part) -> PartResult:
-    """Measure some of the proposed pairs."""
+    """Measure some of the candidate pairs with PnP: arrays of loop closures, and failures by reason."""
     first, last = part.arguments["rows"]
     pairs = read_result(store, part.inputs[-1]).arrays["pairs"][first:last]
     atlas = _atlas(store, part, len(part.inputs) - 1)
@@ -145,7 +148,10 @@ def _links(store: ObjectStore, part: Part) -> PartResult:
 
 
 def _agree(store: ObjectStore, part: Part) -> PartResult:
-    """Select the links of two maps that agree."""
+    """Select the pairwise consistent loop closures between two maps, or within one.
+
+    The array ``rows`` has the row numbers of the accepted ones; rejected ones are counted by reason.
+    """
     maps = part.arguments["maps"]
     atlas = _atlas(store, part, maps)
     links = [link for name in part.inputs[maps:] for link in links_of(read_result(store, name))]
@@ -158,7 +164,7 @@ def _agree(store: ObjectStore, part: Part) -> PartResult:
 
 
 def _tiles(store: ObjectStore, part: Part) -> PartResult:
-    """Align the clouds of two maps by tiles."""
+    """Align the clouds of two maps tile by tile: arrays of loop closures, and other tiles by reason."""
     versions = [_map(store, name) for name in part.inputs[:2]]
     pose = read_result(store, part.inputs[2]).arrays["T_one_other"]
     links, refused = align_tiles(Atlas.of(versions), (versions[0].points, versions[1].points), pose)
@@ -166,7 +172,7 @@ def _tiles(store: ObjectStore, part: Part) -> PartResult:
 
 
 def _optimise(store: ObjectStore, part: Part) -> PartResult:
-    """Optimise a pose graph from its poses."""
+    """Optimise a pose graph, starting at its poses: arrays ``poses`` and ``costs`` (before and after)."""
     graph = graph_of(read_result(store, part.inputs[0]))
     options = msgspec.convert(part.arguments["options"], OptimiseOptions)
     found = optimise_graph(graph, options, chordal=False)
@@ -177,13 +183,14 @@ def _optimise(store: ObjectStore, part: Part) -> PartResult:
 
 
 def _cloud(store: ObjectStore, part: Part) -> PartResult:
-    """Move the cloud of a map with its keyframes."""
+    """Move the points of a map's cloud with its keyframes to the optimised poses: array ``points``."""
     atlas = _atlas(store, part, 1)
     points = _map(store, part.inputs[0]).points
     poses = read_result(store, part.inputs[1]).arrays["poses"]
     return PartResult(arrays={"points": deform_cloud(points, atlas.keyframes, poses)})
 
 
+# The computation of each kind of part.
 _KINDS: dict[str, Callable[[ObjectStore, Part], PartResult]] = {
     "vectors": _vectors,
     "pairs": _pairs,
@@ -206,7 +213,7 @@ def _map(store: ObjectStore, name: str) -> MapVersion:
 
 @functools.lru_cache(maxsize=_CACHED_MAPS)
 def _cached_map(store: Any, name: str) -> MapVersion:
-    """Return a map; its name has its digest, so that it never changes."""
+    """Return the decoded map in the object *name*; the object never changes, since *name* has its digest."""
     return _decoded(store.get(name))
 
 

@@ -1,6 +1,8 @@
-"""Pose graphs in two levels: each map by itself, then the maps against each other as rigid bodies.
+"""Optimise a pose graph in two levels: first each map on its own, then all maps as rigid bodies.
 
-The result is a start for the optimisation of the whole graph, which then needs fewer steps.  Pure.
+The resulting poses are the initial values for the optimisation of the whole graph, which needs fewer
+iterations then.  These functions build the graphs of both levels; the optimisation itself is
+`rse_pf.slam.optimise`.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ Rows = npt.NDArray[np.int64]
 
 
 def graphs_within(graph: PoseGraph, of_map: Rows) -> list[tuple[Rows, PoseGraph]]:
-    """Return for each map the rows of its poses, and the graph of its poses and of the edges between them.
+    """Return for each map the rows of its poses in *graph*, and the graph of these poses and their edges.
 
     Args:
-        graph: Of *n* poses.
-        of_map: ``(n,)``, the map of each pose.
+        graph: The whole pose graph, of ``n`` poses.
+        of_map: ``(n,)``, the number of the map of each pose.
     """
     found = []
     for which in np.unique(of_map).tolist():
@@ -42,15 +44,15 @@ def graphs_within(graph: PoseGraph, of_map: Rows) -> list[tuple[Rows, PoseGraph]
 
 
 def graph_between(graph: PoseGraph, of_map: Rows, T_world_pose: Array) -> tuple[Rows, PoseGraph]:
-    """Return the rigid body of each pose, and the graph that moves these bodies.
+    """Return the number of each pose's rigid body, and the pose graph of the bodies.
 
-    A body is what the edges within one map connect.  The pose of a body is the motion of all its poses from
-    ``T_world_pose``, so that it is the identity at first.
+    A body is a set of poses that are connected by edges within one map.  The pose of a body is the common
+    motion of its poses relative to *T_world_pose*; it is the identity at the start.
 
     Args:
-        graph: Of *n* poses.
-        of_map: ``(n,)``, the map of each pose.
-        T_world_pose: ``(n, 4, 4)``, the poses after each map was optimised by itself.
+        graph: The whole pose graph, of ``n`` poses.
+        of_map: ``(n,)``, the number of the map of each pose.
+        T_world_pose: ``(n, 4, 4)``, the poses after each map was optimised on its own.
     """
     inner = of_map[graph.a] == of_map[graph.b]
     root = connected_components(len(of_map), graph.a[inner], graph.b[inner])
@@ -76,13 +78,13 @@ def graph_between(graph: PoseGraph, of_map: Rows, T_world_pose: Array) -> tuple[
 
 
 def poses_of_levels(body: Rows, T_bodies: Array, T_world_pose: Array) -> Array:
-    """Return ``(n, 4, 4)`` poses: each moved with its body."""
+    """Return the poses ``(n, 4, 4)``, each moved by the pose of its *body* in *T_bodies*."""
     moved: Array = T_bodies[body] @ T_world_pose
     return moved
 
 
 def stacked(parts: Sequence[tuple[Rows, Array]], count: int) -> Array:
-    """Return ``(count, 4, 4)`` poses of rows and their poses."""
+    """Return ``(count, 4, 4)`` poses, into which the poses of each of *parts* are written at their rows."""
     poses = np.zeros((count, 4, 4))
     for rows, each in parts:
         poses[rows] = each

@@ -1,7 +1,7 @@
-"""Serve one rosbridge client: connect a robot with its token, and execute its operations.
+"""Serve one rosbridge client: connect a robot with the client's token, and execute the client's operations.
 
-The platform decides about the token, the services and the limits of commands; nothing is decided here that it
-decides.
+The platform validates the token, and decides which services the client may call and how many commands it may
+send.
 """
 
 from __future__ import annotations
@@ -39,16 +39,22 @@ from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_TOKEN_OVER
 
 __all__ = ["Client"]
 
-_TRY_AGAIN_LATER = 1013  # close code of RFC 6455's registry: the platform cannot be reached now
-_MAX_AUTH_BYTES = 8192  # of a message that comes before the token
-_MAX_WITHOUT_TOKEN = 10  # messages, after which a client without a token is closed
-_REFUSED_S = 1.0  # an unauthenticated client is closed this much later: an address tries few tokens a second
-_BUSY_MS = 200.0  # after this a client with too many unanswered calls may try again
-_ERROR_LEVELS = ("error", "warning", "info")  # of set_level: those with which a client gets errors
+# WebSocket close code (registry of RFC 6455) if the platform cannot be reached now.
+_TRY_AGAIN_LATER = 1013
+# Largest message of a client that has not sent its token yet, in bytes.
+_MAX_AUTH_BYTES = 8192
+# Largest number of messages of a client that has not sent its token; then it is closed.
+_MAX_WITHOUT_TOKEN = 10
+# Pause before a client with a rejected token is closed, in seconds, so that an address can try few tokens.
+_REFUSED_S = 1.0
+# Time after which a client with too many unanswered calls may try again, in ms; it is part of the error.
+_BUSY_MS = 200.0
+# Levels of ``set_level`` with which a client receives status messages about errors.
+_ERROR_LEVELS = ("error", "warning", "info")
 
 
 class Client:
-    """One client and its robot."""
+    """One rosbridge client, and the SDK robot that is connected to the platform for it."""
 
     def __init__(
         self,
@@ -60,15 +66,15 @@ class Client:
         services: tuple[str, ...],
         session: SessionSettings,
     ) -> None:
-        """Describe a client whose WebSocket is open; `serve` does the rest.
+        """Describe a client whose WebSocket is open; `serve` reads from it.
 
         Args:
-            socket: The WebSocket.
-            url: Of the platform.
-            token: That the client sent in its handshake; empty if it sent none.
-            topics: Of all clients.
+            socket: The WebSocket of the client.
+            url: Address of the platform.
+            token: The token in the client's handshake; empty if there is none.
+            topics: The topics of all clients of this process.
             services: Names of the platform's services.
-            session: The limits of a robot.
+            session: Settings with the limits of a robot's connection.
         """
         self._socket, self._topics, self._services, self._session = socket, topics, services, session
         self._token = token
@@ -84,7 +90,10 @@ class Client:
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def serve(self, authenticated: Callable[[], object]) -> None:
-        """Serve until the client leaves or is refused; call *authenticated* when its token is accepted."""
+        """Serve until the client disconnects or is rejected.
+
+        Call *authenticated* when its token is accepted.
+        """
         with contextlib.suppress(ConnectionClosed):
             try:
                 if not self._token:
@@ -115,10 +124,13 @@ class Client:
         while True:
             await self._take(await self._socket.recv(decode=False), identity)
 
-    # --- who it is -----------------------------------------------------------------------------
+    # --- authentication of the client ----------------------------------------------------------
 
     async def _connect(self) -> bool:
-        """Connect the robot, and return True; False if the client left meanwhile."""
+        """Connect the robot to the platform and return True; return False if the client disconnected first.
+
+        An error of the connection is raised.
+        """
 
         async def connect() -> None:
             await self._robot
@@ -136,10 +148,12 @@ class Client:
         return False
 
     async def _await_token(self) -> None:
-        """Read until ``auth`` brings a token; the server bounds the time.
+        """Read messages until ``auth`` with a token arrives, and store the token.
+
+        The server closes a client for which this takes too long.
 
         Raises:
-            Unauthorized: Other messages came, too many or a long one.
+            Unauthorized: The client sent ten other messages, or one of more than 8192 bytes.
         """
         for _ in range(_MAX_WITHOUT_TOKEN):
             data = await self._socket.recv(decode=False)
@@ -156,7 +170,11 @@ class Client:
         raise Unauthorized("no token was sent", hint="send auth with the token as mac first")
 
     def _take_fresh_token(self, token: str, identity: TopicClient) -> None:
-        """Keep *token* for the next renewal; raise Unauthorized for one of another robot."""
+        """Store *token*, which the client sent before the old one expires, for the next renewal.
+
+        Raises:
+            Unauthorized: The token names another robot.
+        """
         if claimed_by(token).get("claimed_robot") != identity.robot:
             raise Unauthorized("this is no token of this robot", hint="the former token stays in use")
         self._token = token
@@ -165,7 +183,15 @@ class Client:
         return self._token
 
     def _identify(self) -> TopicClient:
-        """Return who the client is by its welcome; raises RsePfError if it was another robot before."""
+        """Return robot, tenant and scopes of the client, as the platform's welcome states them.
+
+        On a renewed connection only the scopes are updated.
+
+        Raises:
+            Disconnected: The platform closed the connection.
+            UnsupportedProtocol: The backend server is of a version that does not name tenants.
+            Unauthorized: The token is of another robot than that of the connection before.
+        """
         welcome, before = self._robot.welcome, self._identity
         if welcome is None:
             raise Disconnected("the platform closed the connection", hint="connect again")
@@ -182,7 +208,11 @@ class Client:
         return before
 
     def _follow_robot(self, change: str, _: str) -> None:
-        """End a client that the platform refuses, and check who it is on a new connection."""
+        """Handle a *change* of the robot's connection.
+
+        A client that the platform rejects is closed.  After a reconnection or migration the identity is
+        checked again.
+        """
         if self._identity is None:
             return
         error = self._robot.failure if change == "refused" else None
@@ -195,7 +225,7 @@ class Client:
             self._spawn(self._end(error))
 
     async def _end(self, error: RsePfError) -> None:
-        """Send the reason, and close the WebSocket."""
+        """Send the client *error*, and close the WebSocket with a close code for it."""
         code = _TRY_AGAIN_LATER
         if isinstance(error, Unauthorized):
             code = CLOSE_TOKEN_OVER
@@ -205,10 +235,10 @@ class Client:
             await self._write(refusal(Operation(op="auth"), error))
             await self._socket.close(code, error.code)
 
-    # --- operations ----------------------------------------------------------------------------
+    # --- execution of the client's operations --------------------------------------------------
 
     async def _take(self, data: bytes, identity: TopicClient) -> None:
-        """Execute the operation in one message, or say why not."""
+        """Execute the operation in the message *data*, or send the client the error."""
         try:
             wait_s = 0.0 if self._rate is None else self._rate.take(time.monotonic())
             if wait_s > 0:
@@ -228,7 +258,9 @@ class Client:
                 self._topics.execute(identity, operation)
         except Busy as error:
             await self._refuse(data, error)
-            await asyncio.sleep(1e-3 * (error.retry_after_ms or 0.0))  # so that a flood is not read
+            await asyncio.sleep(
+                1e-3 * (error.retry_after_ms or 0.0)
+            )  # too many messages are not read meanwhile
         except RsePfError as error:
             await self._refuse(data, error)
 
@@ -258,7 +290,11 @@ class Client:
             await self._write(reply)
 
     def _describe(self, what: str, call: Operation, identity: TopicClient) -> dict[str, Any]:
-        """Answer one of the calls of ``rosapi`` that clients need to find services and topics."""
+        """Return the values for a call of ``/rosapi/<what>``, with which clients list services and topics.
+
+        Raises:
+            UnknownService: *what* is not supported.
+        """
         services = [name for name in self._services if identity.may(f"services:{name}")]
         types = self._topics.readable_by(identity)
         if what == "services":
@@ -281,7 +317,10 @@ class Client:
             await self._write(refusal(head, error))
 
     async def _write(self, text: bytes) -> None:
-        """Send a message; a client that takes none of it for long is cut off."""
+        """Send *text* to the client.
+
+        Cut the connection if the client does not read it within the ping timeout.
+        """
         within_s = self._session.ping_interval_s + self._session.ping_timeout_s
         try:
             await asyncio.wait_for(self._socket.send(text, text=True), within_s)
@@ -295,7 +334,7 @@ class Client:
 
 
 def _decoded(call: Operation) -> Any:
-    """Return the arguments of a call; raises BadRequest."""
+    """Return the decoded arguments of *call*; raises BadRequest if they are malformed."""
     try:
         return msgspec.json.decode(call.args)
     except (msgspec.DecodeError, RecursionError, ValueError) as error:
@@ -303,7 +342,11 @@ def _decoded(call: Operation) -> Any:
 
 
 def _argument(call: Operation, name: str) -> str:
-    """Return the argument *name* of a call of ``rosapi``, without a slash before it; raises BadRequest."""
+    """Return the argument *name* of a ``rosapi`` call without its leading slash, empty if it is missing.
+
+    Raises:
+        BadRequest: The arguments are no JSON object of texts.
+    """
     try:
         value = msgspec.json.decode(call.args, type=dict[str, str]).get(name, "")
     except msgspec.DecodeError as error:

@@ -21,7 +21,7 @@ __all__ = ["ACTION"]
 
 @dataclass(frozen=True, kw_only=True)
 class RosbridgeRequest:
-    """The platform, and the address at which rosbridge clients connect."""
+    """Options of ``rse-pf rosbridge``: the platform, and the address to which rosbridge clients connect."""
 
     url: str | None = option(
         "--url",
@@ -41,7 +41,7 @@ class RosbridgeRequest:
 
 
 def run_rosbridge(request: RosbridgeRequest, settings: PlatformSettings) -> int:
-    """Serve until a signal ends the process."""
+    """Check the options, and serve until a signal ends the process; return the exit code."""
     if request.announce is not None and not request.announce.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {request.announce.absolute().parent}", hint="create the folder")
     from rse_pf.extensions.rosbridge.server import serve_rosbridge

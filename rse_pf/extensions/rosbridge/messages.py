@@ -1,6 +1,6 @@
-"""Read the operations of rosbridge v2, and write what clients are answered.
+"""Decode the operations of rosbridge v2, and encode the answers to clients.
 
-The message of a ``publish`` is checked and passed on as its text; no object is made of it.
+The message of a ``publish`` is only checked, and passed on as the same JSON text without decoding.
 
 Source:
     The rosbridge v2.0 protocol specification, RobotWebTools/rosbridge_suite, ROSBRIDGE_PROTOCOL.md.
@@ -19,12 +19,15 @@ from rse_pf.wire import arrays
 
 __all__ = ["Head", "Operation", "publication", "read_head", "read_operation", "refusal", "response"]
 
+# The supported values of ``op``.
 OPS = frozenset(
     (
         "auth", "call_service", "advertise", "unadvertise", "publish", "subscribe", "unsubscribe",
         "set_level", "status",
     )
 )  # fmt: skip
+# Values of ``op`` in the rosbridge specification that are not supported: subject and verb of the error
+# message.
 _UNSUPPORTED = {
     "png": "PNG compression is",
     "cbor": "CBOR is",
@@ -41,7 +44,7 @@ Identity = Annotated[str, msgspec.Meta(max_length=256)] | int | None
 
 
 class Head(msgspec.Struct, frozen=True):
-    """What a refusal names of a message: its operation, its id, and the service of a call."""
+    """The fields of a rejected message that the answer repeats: operation, id, and service of a call."""
 
     op: Any = None
     id: Any = None
@@ -49,7 +52,7 @@ class Head(msgspec.Struct, frozen=True):
 
 
 class Operation(msgspec.Struct, frozen=True):
-    """Every field of every operation that is read; the others are ignored."""
+    """An operation of a client: the fields of all operations; unknown fields are ignored."""
 
     op: Name
     id: Identity = None
@@ -98,18 +101,18 @@ _UNENCODABLE = (RecursionError, ValueError, TypeError, OverflowError)
 
 
 def read_operation(data: bytes, budget: Budget) -> Operation:
-    """Return the operation in one message.
+    """Return the operation in the message *data*.
 
-    NaN and Infinity, which are no JSON but which Python programs write, become null in messages of topics, as
-    rosbridge_suite sends them; the arguments of a service must be finite.
+    NaN and Infinity are no JSON, but Python programs write them: in messages of topics they become null, as
+    in rosbridge_suite; in the arguments of a service they are an error.
 
     Raises:
-        ProtocolError: It is no operation that is supported here, or exceeds *budget*.
+        ProtocolError: The message is malformed or not supported, or exceeds a limit of *budget*.
     """
     check_size(data, budget)
     try:
         operation = _decode(data)
-        data.decode()  # what is passed on is text
+        data.decode()  # raises unless the message is valid UTF-8, since parts of it are passed on as text
     except msgspec.ValidationError as error:
         raise BadMessage(str(error)[:200], hint=_PAGE) from error
     except _UNDECODABLE as error:
@@ -130,14 +133,19 @@ def read_operation(data: bytes, budget: Budget) -> Operation:
 
 
 def _read_not_finite(data: bytes, budget: Budget, error: Exception) -> Operation:
-    """Return the operation in *data*, which *error* says is no JSON, if NaN and Infinity are the reason."""
+    """Return the operation in *data* if only NaN and Infinity make it invalid JSON.
+
+    Raises:
+        BadMessage: *data* is malformed in another way, for which *error* was raised, or is a call of a
+            service.
+    """
     malformed = BadMessage(
         f"not a message of rosbridge: {str(error)[:150]}", hint="send JSON as text, not CBOR"
     )
     check_json(data, budget)
     not_finite: list[str] = []
     try:
-        value = json.loads(data, parse_constant=not_finite.append)  # which returns None: null
+        value = json.loads(data, parse_constant=not_finite.append)  # append returns None, which becomes null
         operation = _decode(json.dumps(value, allow_nan=False))
     except _UNDECODABLE:
         raise malformed from error
@@ -151,7 +159,10 @@ def _read_not_finite(data: bytes, budget: Budget, error: Exception) -> Operation
 
 
 def read_head(data: bytes) -> Head:
-    """Return what can be read of a message that was refused, for the answer; nothing of malformed JSON."""
+    """Return operation, id and service of the rejected message *data*, as far as they are valid.
+
+    All are None for malformed JSON.
+    """
     try:
         head = msgspec.convert(json.loads(data), Head)
     except _UNDECODABLE:
@@ -162,7 +173,7 @@ def read_head(data: bytes) -> Head:
 
 
 def _is_text(value: Any) -> bool:
-    """Return whether *value* is a text that can be sent; one with a lone surrogate cannot."""
+    """Return whether *value* is a text that can be encoded as UTF-8; one with a lone surrogate cannot."""
     try:
         return isinstance(value, str) and value.encode() is not None
     except UnicodeEncodeError:
@@ -170,15 +181,15 @@ def _is_text(value: Any) -> bool:
 
 
 def publication(topic: str, message: bytes) -> bytes:
-    """Return the text that brings the JSON *message* to a subscriber of *topic*."""
+    """Return the encoded ``publish`` with the JSON *message* for a subscriber of *topic*."""
     return _encode(_Publication("publish", topic, msgspec.Raw(message)))
 
 
 def response(call: Operation | Head, values: Any, *, is_result: bool = True) -> bytes:
-    """Return the answer *values* to a call.
+    """Return the encoded ``service_response`` with *values* for *call*; *is_result* is False for an error.
 
     Raises:
-        BadMessage: They cannot be written as JSON.
+        BadMessage: The values cannot be encoded as JSON.
     """
     try:
         return _encode(_Response("service_response", call.service, values, is_result, call.id))
@@ -189,7 +200,7 @@ def response(call: Operation | Head, values: Any, *, is_result: bool = True) -> 
 
 
 def refusal(of: Operation | Head, error: RsePfError) -> bytes:
-    """Return the answer to a call that failed by *error*, or the status about another operation."""
+    """Return the encoded answer about *error*: a ``service_response`` for a call, else a ``status``."""
     named = {"code": error.code, "message": error.message, "hint": error.hint}
     if of.op == "call_service":
         return response(of, {**named, "retry_after_ms": error.retry_after_ms}, is_result=False)

@@ -1,6 +1,6 @@
-"""Send one client the messages of its topics, as fast as it reads them and as often as it asked for.
+"""Send one client the messages of its topics, not faster than it reads, nor than its subscriptions ask for.
 
-While the client has to wait, the newest messages of each subscription wait with it.
+Messages that cannot be sent yet wait in the queues of the subscriptions, of which the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ __all__ = ["TopicSender"]
 
 
 class Ping(Protocol):
-    """Sends a WebSocket ping; what it returns is done with the pong, or fails with the connection."""
+    """A function that sends a WebSocket ping."""
 
     async def __call__(self) -> Awaitable[float]:
-        """Send it."""
+        """Send a ping; return an awaitable that is done with the pong, or fails with the connection."""
 
 
 class TopicSender:
-    """The messages that wait for one client."""
+    """Sends one client the messages that wait in its subscriptions."""
 
     def __init__(
         self, *, write: Callable[[bytes], Awaitable[None]], ping: Ping, clock: Callable[[], float]
     ) -> None:
-        """Send nothing yet; `run` does.
+        """Describe the client; `run` sends.
 
         Args:
-            write: Sends a WebSocket message.
-            ping: Sends a WebSocket ping.
-            clock: Seconds, monotonic.
+            write: Sends a WebSocket message to the client.
+            ping: Sends a WebSocket ping to the client.
+            clock: Returns seconds, monotonic.
         """
         self._write, self._ping, self._clock = write, ping, clock
         self._pacing = Pacing()
@@ -43,7 +43,10 @@ class TopicSender:
         self._pong: asyncio.Task[None] | None = None
 
     def put(self, subscription: Subscription, message: TopicMessage) -> None:
-        """Let *message* be sent, or wait in its *subscription* while the client has to wait."""
+        """Add *message* to the queue of *subscription*, from which `run` sends it.
+
+        While nothing may be sent, messages above the requested queue length are dropped at once.
+        """
         subscription.put(message)
         if self._pacing.is_slow or subscription.wait_s(self._clock()) > 0:
             subscription.drop_surplus()
@@ -51,7 +54,10 @@ class TopicSender:
         self._wake.set()
 
     async def run(self) -> None:
-        """Send until cancelled, or until the connection has ended, with the error of *write* or *ping*."""
+        """Send messages until cancelled.
+
+        When the connection is lost, the error of *write* or *ping* is raised.
+        """
         try:
             while True:
                 await self._next_due()
@@ -60,7 +66,9 @@ class TopicSender:
                 del self._due[subscription]
                 message = subscription.take(self._clock())
                 if subscription:
-                    self._due[subscription] = None  # behind the others
+                    self._due[subscription] = (
+                        None  # its next message comes after those of other subscriptions
+                    )
                 await self._write(message)
                 if self._pacing.is_free and self._pong is None:
                     self._pong = asyncio.ensure_future(self._measure())
@@ -70,7 +78,10 @@ class TopicSender:
                 await asyncio.gather(self._pong, return_exceptions=True)
 
     async def _next_due(self) -> Subscription:
-        """Wait until a subscription has a message that may be sent now, and return the first one."""
+        """Wait until a subscription has a message that may be sent now.
+
+        Return the first such subscription.
+        """
         while True:
             self._wake.clear()
             now, wait_s = self._clock(), float("inf")
@@ -87,7 +98,7 @@ class TopicSender:
                 await asyncio.wait_for(self._wake.wait(), None if wait_s == float("inf") else wait_s)
 
     async def _pace(self) -> None:
-        """Wait until the client may be sent the next message."""
+        """Wait until the next message may be sent to the client, as the pacing decides."""
         if self._pong is not None and self._pacing.is_slow:
             await self._pong
         if not self._pacing.is_free:
@@ -95,7 +106,10 @@ class TopicSender:
             await self._measure()
 
     async def _measure(self) -> None:
-        """Send a ping, and wait for its pong; while that is late, only the newest messages wait."""
+        """Send a ping, wait for its pong, and record its delay.
+
+        When the pong becomes late, messages above the requested queue lengths are dropped.
+        """
         began = self._clock()
         pong = asyncio.ensure_future(await self._ping())
         done, _ = await asyncio.wait({pong}, timeout=self._pacing.late_s)

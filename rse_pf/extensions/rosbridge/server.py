@@ -1,7 +1,7 @@
-"""Run the rosbridge server: one process that accepts clients, and a health page for load balancers.
+"""Run the rosbridge server: one process that accepts clients and answers health checks of load balancers.
 
-A client shows its token in the handshake or, as browsers have to, in the first message.  Until the platform
-has accepted it, a client is one of a bounded number that stay for a bounded time.
+A client sends its token in the WebSocket handshake or, as browsers must, in its first message.  The number of
+clients whose token the platform has not accepted yet is limited, and so is the time that they have.
 """
 
 from __future__ import annotations
@@ -35,14 +35,16 @@ from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_TOKEN_OVER
 
 __all__ = ["open_rosbridge", "serve_rosbridge"]
 
-# Of one address, after a burst.  The platform sees the handshakes of all clients as those of one address, and
-# allows it ten times as many: nobody can use up what the others need.
+# Largest rate of handshakes of one address, after a burst.  For the platform, the handshakes of all clients
+# come from the address of this process, and it allows ten times as many, so that one client cannot use up the
+# limit of all.
 _HANDSHAKES_PER_S = 20.0
-_TOKEN_S = 5.0  # from the handshake to a token that the platform has accepted
+# Longest time from the handshake until the platform has accepted a client's token, in seconds.
+_TOKEN_S = 5.0
 
 
 class _Clients:
-    """All clients of this process."""
+    """Accepts all clients of this process, and enforces the limits on unauthenticated ones."""
 
     def __init__(self, settings: PlatformSettings, url: str) -> None:
         self._settings, self._url = settings, url
@@ -60,7 +62,7 @@ class _Clients:
         self._closing: set[asyncio.Task[None]] = set()
 
     def answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer what asks for no WebSocket, or for one that is refused; None lets the client in."""
+        """Return the HTTP response to a health check or to a rejected request; None to open the WebSocket."""
         headers = request.headers
         path = request.path.partition("?")[0]
         if path == HEALTH_PATH:
@@ -79,7 +81,7 @@ class _Clients:
         return None
 
     async def serve_client(self, connection: ServerConnection) -> None:
-        """Serve one client whose handshake is done."""
+        """Serve a client whose WebSocket is open, until it disconnects."""
         assert connection.request is not None
         headers = connection.request.headers
         offered = ",".join(headers.get_all("Sec-WebSocket-Protocol")).replace(" ", "").split(",")
@@ -96,7 +98,7 @@ class _Clients:
             self._silent.leave(connection)
 
     def _source(self, connection: ServerConnection, request: Request) -> str:
-        """Return the address of a client."""
+        """Return the IP address of a client, from ``X-Forwarded-For`` if a load balancer is configured."""
         forwarded = ",".join(request.headers.get_all("X-Forwarded-For"))
         return self._rates.source(str(connection.remote_address[0]), forwarded)
 
@@ -109,18 +111,18 @@ class _Clients:
 def serve_rosbridge(
     settings: PlatformSettings, *, url: str, host: str, port: int, announce: Path | None
 ) -> int:
-    """Serve until a signal ends the process; return the exit code.
+    """Serve until SIGTERM or SIGINT; return the exit code.
 
     Args:
-        settings: Groups serving, session and data.
-        url: Of the platform, ``ws://HOST:PORT/ws``.
+        settings: Settings of the platform; the groups serving, session and data are used.
+        url: Address of the platform, ``ws://HOST:PORT/ws``.
         host: Address to listen on.
-        port: 0 takes a free one.
-        announce: File that gets pid and port as JSON when clients can connect.
+        port: Port to listen on; 0 takes a free one.
+        announce: File to which pid and port are written as JSON when clients can connect; None for no file.
 
     Raises:
-        ConfigurationError: The address is taken.
-        UsageError: *url* is not of a platform, or *port* is no port.
+        ConfigurationError: The address and port cannot be used, for example because another process does.
+        UsageError: *url* is not the address of a platform, or *port* is out of range.
     """
     if not 0 <= port < 65536:
         raise UsageError(f"{port} is not a port", hint="name one from 1 to 65535, or 0 for a free one")
@@ -138,11 +140,11 @@ def serve_rosbridge(
 
 
 async def open_rosbridge(settings: PlatformSettings, url: str, listening: socket.socket) -> Server:
-    """Accept clients of the platform at *url* on *listening*, and return what does so."""
+    """Start to accept clients on the socket *listening*, for the platform at *url*; return the server."""
     session = settings.session
     clients = _Clients(settings, url)
-    # asyncio does this only for sockets that name their protocol; without it, the ping behind a message waits
-    # for the delayed acknowledgement of the message.
+    # asyncio sets TCP_NODELAY only for sockets that name their protocol.  Without it, a ping that follows a
+    # message waits for the delayed acknowledgement of the message.
     listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     server: Server = await serve(
         clients.serve_client, sock=listening, process_request=clients.answer_request, compression=None,
@@ -159,7 +161,7 @@ async def _serve_until_signal(
     over = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, over.set)
-    # Clients that are not authenticated must not fill the log.
+    # Unauthenticated clients must not fill the log with failed handshakes.
     logging.getLogger("websockets.server").addFilter(lambda record: record.msg != "opening handshake failed")
     server = await open_rosbridge(settings, url, listening)
     if announce is not None:

@@ -1,6 +1,6 @@
-"""What one rosbridge client still has to get of one topic: the newest messages, not faster than it asked for.
+"""The queue of messages of one topic for one rosbridge client, with the client's rate and queue length.
 
-Times and messages go in, the messages that are due come out: there is no clock, no loop and no socket here.
+The class is given all times and messages; it uses no clock, no event loop and no socket.
 """
 
 from __future__ import annotations
@@ -12,14 +12,19 @@ from rse_pf.extensions.rosbridge.messages import publication
 __all__ = ["MAX_HELD_BYTES", "MAX_QUEUE_LENGTH", "HeldBytes", "Subscription", "TopicMessage"]
 
 MAX_QUEUE_LENGTH = 100
+"""Largest number of messages that wait for one subscription."""
 MAX_HELD_BYTES = 32 << 20
-"""Messages that wait for all subscriptions of a tenant; above it each keeps the newest only."""
+"""Bytes of messages that wait for all subscriptions of a tenant.
+
+Above it, a subscription stores only its newest
+message."""
+# Largest number of bytes of messages that wait for one subscription; its newest message is stored in any
+# case.
 _MAX_QUEUE_BYTES = 1 << 20
-"""Messages that wait for one subscription, all together; the newest is kept in any case."""
 
 
 class HeldBytes:
-    """How many bytes wait for the slow subscribers of one tenant."""
+    """The number of bytes of messages that wait for all subscriptions of one tenant."""
 
     __slots__ = ("of_tenant",)
 
@@ -28,7 +33,10 @@ class HeldBytes:
 
 
 class TopicMessage:
-    """The JSON that a client published, and what its subscribers get, made once for each spelling."""
+    """The JSON that a client published, and the WebSocket messages for subscribers.
+
+    A WebSocket message is encoded once for each spelling of the topic (with or without a leading slash).
+    """
 
     __slots__ = ("_encoded", "data")
 
@@ -45,11 +53,12 @@ class TopicMessage:
 
 
 class Subscription:
-    """One client's subscription to one topic, however many times it subscribed.
+    """One client's subscription to one topic, for all of the client's requests to subscribe to it.
 
     Attributes:
-        spelling: The topic as the client wrote it first.
-        requests: The shortest pause in s and the queue length of each request, by its id.
+        spelling: The topic's name as the client wrote it first.
+        requests: Shortest time between two messages (s) and queue length of each request, by the request's
+            id.
     """
 
     __slots__ = ("_bytes", "_held", "_next_s", "_waiting", "requests", "spelling")
@@ -63,31 +72,34 @@ class Subscription:
         self._next_s = float("-inf")
 
     def __len__(self) -> int:
-        """Return how many messages wait."""
+        """Return the number of waiting messages."""
         return len(self._waiting)
 
     def clear(self) -> None:
-        """Forget the waiting messages, because the subscription has ended."""
+        """Drop the waiting messages; called when the subscription ends."""
         self._waiting.clear()
         self._count(-self._bytes)
 
     def put(self, message: TopicMessage) -> None:
-        """Add *message*; the oldest ones are dropped above the longest queue that there is."""
+        """Add *message* to the queue; drop the oldest messages above the limits of length and bytes."""
         self._waiting.append(message)
         self._count(len(message.data))
         self._drop_beyond(MAX_QUEUE_LENGTH if self._held.of_tenant <= MAX_HELD_BYTES else 1)
 
     def drop_surplus(self) -> None:
-        """Drop the oldest messages above the queue that was asked for: the client has to wait now."""
+        """Drop the oldest messages above the longest queue length that the client requested.
+
+        This is called while no message may be sent to the client.
+        """
         if self.requests:
             self._drop_beyond(max(length for _, length in self.requests.values()))
 
     def wait_s(self, now: float) -> float:
-        """Return 0 if a message may be sent at *now* (s), else the seconds until then."""
+        """Return the seconds until the next message may be sent; 0 if it may be sent at *now* (s)."""
         return max(0.0, self._next_s - now)
 
     def take(self, now: float) -> bytes:
-        """Return the WebSocket message that is sent at *now* (s)."""
+        """Remove the oldest message and return its WebSocket message, which the caller sends at *now* (s)."""
         message = self._waiting.popleft()
         self._count(-len(message.data))
         self._next_s = now + min(pause_s for pause_s, _ in self.requests.values())

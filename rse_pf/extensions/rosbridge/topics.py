@@ -1,7 +1,7 @@
-"""The topics of all clients of this process: who publishes, who subscribes, and which messages are latched.
+"""The topics of all clients of this process, with their publishers, subscriptions and latched messages.
 
-A topic belongs to a tenant.  A message is kept once for all of its subscribers; when each of them gets it is
-decided by `rse_pf.extensions.rosbridge.sender`.
+A topic belongs to a tenant.  A message is stored once for all its subscribers; the module
+`rse_pf.extensions.rosbridge.sender` decides when it is sent to each of them.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ from rse_pf.extensions.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes
 __all__ = ["TopicClient", "Topics"]
 
 MAX_TOPICS = 64
-"""Topics that one client advertises."""
+"""Largest number of topics that one client advertises."""
 MAX_SUBSCRIPTIONS = 64
-"""Subscriptions of one client, counted by their ids."""
+"""Largest number of subscriptions of one client, counted by their ids."""
 MAX_TOPICS_OF_TENANT = 1000
-"""Topics of one tenant."""
+"""Largest number of topics of one tenant."""
 MAX_LATCHED_BYTES = 4 << 20
-"""Latched messages of one tenant, all together."""
+"""Largest number of bytes of all latched messages of one tenant."""
+# Longest time between two messages of a subscription (``throttle_rate``), in seconds; longer ones are
+# shortened.
 _MAX_PAUSE_S = 3600.0
 _NAME = re.compile(r"/?[A-Za-z~][A-Za-z0-9_~.-]{0,127}(?:/[A-Za-z0-9_~.-]{1,128}){0,16}")
 
 Key = tuple[str, str]
-"""Tenant and topic, without the slash before its name."""
+"""Tenant, and name of a topic without its leading slash."""
 
 
 @dataclass(eq=False, slots=True, kw_only=True)
 class TopicClient:
-    """A client as topics see it: what the platform says of its token, and the way to it."""
+    """A client of topics: robot, tenant and scopes of its token, and the sender of its messages."""
 
     robot: str
     tenant: str
@@ -42,7 +44,7 @@ class TopicClient:
     sender: TopicSender
 
     def may(self, right: str) -> bool:
-        """Return whether the token allows *right*."""
+        """Return whether the scopes of the client's token allow *right*, such as ``topics:read``."""
         return scopes_allow(self.scopes, right)
 
 
@@ -51,13 +53,13 @@ class _Topic:
     key: Key
     type: str
     publishers: dict[TopicClient, bool] = field(default_factory=dict)
-    """Whether a publisher latches."""
+    """For each publisher, whether its messages are latched."""
     subscriptions: dict[TopicClient, Subscription] = field(default_factory=dict)
     latched: dict[TopicClient, TopicMessage] = field(default_factory=dict)
 
 
 class Topics:
-    """All topics of one process."""
+    """All topics of this process, by tenant and name."""
 
     def __init__(self) -> None:
         self._topics: dict[Key, _Topic] = {}
@@ -67,10 +69,10 @@ class Topics:
         self._of_client: dict[TopicClient, dict[Key, None]] = {}
 
     def execute(self, client: TopicClient, operation: Operation) -> None:
-        """Execute an operation of a client on a topic.
+        """Execute *operation* of *client*: subscribe, unsubscribe, advertise, unadvertise or publish.
 
         Raises:
-            RsePfError: The token or a limit does not allow it, or the topic has another type.
+            RsePfError: The token or a limit does not allow the operation, or the topic has another type.
         """
         key = _key(client, operation.topic)
         reads = operation.op in ("subscribe", "unsubscribe")
@@ -89,7 +91,7 @@ class Topics:
             self._publish(client, key, operation)
 
     def leave(self, client: TopicClient) -> None:
-        """Forget a client whose connection ended."""
+        """Remove the publications, latched messages and subscriptions of a client that disconnected."""
         for key in list(self._of_client.get(client, ())):
             topic = self._topics[key]
             topic.publishers.pop(client, None)
@@ -98,13 +100,13 @@ class Topics:
             self._settle(topic, client)
 
     def readable_by(self, client: TopicClient) -> dict[str, str]:
-        """Return the types of the tenant's topics, by their names, if the client may read topics."""
+        """Return the types of the tenant's topics by name; empty if the client may not read topics."""
         if not client.may("topics:read"):
             return {}
         own = (topic for topic in self._topics.values() if topic.key[0] == client.tenant)
         return dict(sorted((topic.key[1], topic.type) for topic in own))
 
-    # --- operations ----------------------------------------------------------------------------
+    # --- execution of each operation -----------------------------------------------------------
 
     def _advertise(self, client: TopicClient, key: Key, operation: Operation) -> _Topic:
         own = self._of_client.get(client, ())
@@ -170,10 +172,15 @@ class Topics:
         else:
             subscription.requests.pop(operation.id, None)
 
-    # --- topics --------------------------------------------------------------------------------
+    # --- creation and removal of topics --------------------------------------------------------
 
     def _use_topic(self, client: TopicClient, key: Key, type_name: str) -> _Topic:
-        """Return the topic *key*, which *client* uses from now on as one of messages of type *type_name*."""
+        """Return the topic *key*, created if necessary, and record that *client* uses it.
+
+        Raises:
+            Conflict: The topic has another type than *type_name*; an empty type fits every topic.
+            QuotaExceeded: The tenant has too many topics.
+        """
         topic = self._topics.get(key)
         present = "" if topic is None else topic.type
         if type_name and present and _ros1_name(type_name) != _ros1_name(present):
@@ -189,7 +196,7 @@ class Topics:
         return topic
 
     def _settle(self, topic: _Topic, client: TopicClient) -> None:
-        """Drop *topic* from those of *client* if it uses it no longer, and altogether if nobody does."""
+        """Remove *topic* from the topics of *client* if it no longer uses it; delete a topic nobody uses."""
         if client in topic.publishers or client in topic.subscriptions:
             return
         own = self._of_client.get(client, {})
@@ -205,7 +212,7 @@ class Topics:
             self._held.pop(tenant, None)
 
     def _end(self, topic: _Topic, client: TopicClient) -> None:
-        """End a subscription."""
+        """Remove the subscription of *client* to *topic*, if there is one, with its waiting messages."""
         subscription = topic.subscriptions.pop(client, None)
         if subscription is not None:
             subscription.clear()
