@@ -1,5 +1,6 @@
-"""The fleet page: one look at a running platform, in a browser on this machine, from a process of its own.
+"""The fleet page: a web page on this machine that shows a running platform, served by a process of its own.
 
-The process reads what the control plane tells its operator, the logs, and live maps; it passes all of it on
-to browsers by server-sent events.  Robots and servers notice nothing of it, and nothing depends on it.
+The process reads the operator's port of the control plane, the logs and the live maps, and sends their
+content to browsers as server-sent events.  Robots and servers are not affected by it, and nothing depends on
+it.
 """

@@ -1,6 +1,6 @@
 """Run the fleet page of a platform of this machine: ``python -m rse_pf.extensions.fleet_page FOLDER``.
 
-Prints one line of JSON with its address, and serves until its parent ends.
+The process prints one line of JSON with the page's address, and serves until its parent exits.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["main"]
 
 
 def main() -> int:
-    """Serve the page, and return the exit code."""
+    """Parse the arguments, serve the page until a signal or the parent's exit, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m rse_pf.extensions.fleet_page")
     parser.add_argument("folder", type=Path, help="folder of the platform's state")
     parser.add_argument("--port", type=int, default=0, help="port on loopback; 0 takes a free one")

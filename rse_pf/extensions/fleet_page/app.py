@@ -1,7 +1,8 @@
-"""The page as an ASGI application: its files, sessions, the stream of what happens, and operations.
+"""The page as an ASGI application: static files, sessions, the stream of messages, and operations.
 
-Files are public and say nothing about the platform; everything else needs a session in the header
-``Authorization``.  A request for another host name, or from a page of another origin, is refused first.
+The static files are public and hold no data of the platform; every other request needs a session in the
+header ``Authorization``.  A request with another host name than loopback, or from a page of another origin,
+is rejected.
 """
 
 from __future__ import annotations
@@ -37,12 +38,15 @@ _HEADERS = (
     (b"cross-origin-opener-policy", b"same-origin"),
     (b"cross-origin-resource-policy", b"same-origin"),
 )
+# Largest body of a request, in bytes.
 _MAX_BODY_BYTES = 4096
-# With any port, since a port may be forwarded (ssh -L).  A page of another site whose name was made to lead
-# here (DNS rebinding) has its own name in Host.
+# Accepted values of the header Host: loopback with any port, since a port may be forwarded (ssh -L).  A page
+# of another site whose name resolves to loopback (DNS rebinding) has the name of that site in Host.
 _LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
+# Topics of the stream, besides "live/MAP".
 _TOPICS = frozenset(("fleet", "history", "robots", "event", "audit", "pose", "link", "maps"))
 _LIVE = "live/"
+# HTTP status of an error by its code; 400 for all others.
 _STATUS = {
     Unauthorized.code: 401,
     Forbidden.code: 403,
@@ -58,10 +62,10 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PageActions:
-    """What the page can ask for beside its stream; each raises RsePfError.
+    """The functions that the page calls in addition to its stream; both may raise RsePfError.
 
-    ``operate`` takes the action and its parameters and returns what was done; ``page`` takes a name and
-    parameters, and returns a media type and a body.
+    ``operate(action, parameters)`` executes an operation on the platform and returns its result.
+    ``page(name, parameters)`` returns the media type and the body of a document, such as a point cloud.
     """
 
     operate: Callable[[str, Mapping[str, str]], Awaitable[Mapping[str, Any]]]
@@ -79,11 +83,11 @@ class _Request:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PageAccess:
-    """Who may ask for the page.
+    """The authentication of the page's users.
 
     Attributes:
-        sessions: Those who may read and operate.
-        admin_token: Returns the token of the control ports, for which new keys are made.
+        sessions: The sessions and keys of users who may view or operate.
+        admin_token: Returns the token of the control ports; who sends it may request new keys.
     """
 
     sessions: PageSessions
@@ -91,7 +95,7 @@ class PageAccess:
 
 
 class FleetApp:
-    """The application."""
+    """The ASGI application of the page."""
 
     def __init__(
         self,
@@ -102,14 +106,14 @@ class FleetApp:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Serve nothing yet.
+        """Describe the application.
 
         Args:
-            hub: What is told.
-            access: Who may ask.
-            files: Of the page, by path.
-            actions: What the page can ask for.
-            clock: Seconds of sessions and keys.
+            hub: The messages of the stream.
+            access: The authentication of users.
+            files: The static files of the page, by path.
+            actions: The operations and documents that the page requests.
+            clock: Returns seconds, monotonic, for the expiry of sessions and keys.
         """
         self._hub = hub
         self._sessions = access.sessions
@@ -119,7 +123,7 @@ class FleetApp:
         self._clock = clock
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Answer one HTTP request; an RsePfError becomes a JSON body with code, message and hint."""
         if scope["type"] != "http":
             return
         try:
@@ -127,7 +131,9 @@ class FleetApp:
             self._check_origin(request)
             await self._answer(request, receive, send)
         except RsePfError as error:
-            with contextlib.suppress(OSError, RuntimeError):  # the answer may have begun
+            with contextlib.suppress(
+                OSError, RuntimeError
+            ):  # raised if a part of the answer was sent already
                 await _send(send, _STATUS.get(error.code, 400), _error_document(error))
 
     def _check_origin(self, request: _Request) -> None:
@@ -190,7 +196,9 @@ class FleetApp:
             raise BadRequest("a stream needs topics", hint=f"some of {', '.join(sorted(_TOPICS))}, live/MAP")
         messages = self._hub.messages(topics)
         async with contextlib.aclosing(messages):
-            first = await messages.__anext__()  # refused before the answer begins
+            first = (
+                await messages.__anext__()
+            )  # raises Busy before the answer begins, if too many pages are open
             await send(_start(200, b"text/event-stream", ((b"cache-control", b"no-store"),)))
             await send({"type": "http.response.body", "body": first, "more_body": True})
             sending = asyncio.ensure_future(self._send_messages(request, messages, send))
@@ -206,19 +214,24 @@ class FleetApp:
 
     async def _send_messages(self, request: _Request, messages: AsyncIterator[bytes], send: Send) -> None:
         async for message in messages:
-            # uvicorn waits here for a slow browser, and raises nothing for one that left.
+            # uvicorn waits here for a slow browser, and raises no error for a closed connection.
             await send({"type": "http.response.body", "body": message, "more_body": True})
             self._sessions.role_of(request.session, now_s=self._clock())
 
 
 async def _wait_until_left(receive: Receive) -> None:
-    """Wait until the browser is gone, and not for the next message to it: its place is another page's."""
+    """Wait until the browser disconnects, so that its stream ends at once, and not at the next message."""
     while (await receive())["type"] != "http.disconnect":
         pass
 
 
 async def _body(receive: Receive) -> dict[str, Any]:
-    """Return the body of a request as a JSON object; raises BadRequest, LimitExceeded."""
+    """Return the body of a request, a JSON object.
+
+    Raises:
+        BadRequest: The body is no JSON object, or the browser disconnected.
+        LimitExceeded: The body has more than 4096 bytes.
+    """
     data = b""
     while True:
         part = await receive()

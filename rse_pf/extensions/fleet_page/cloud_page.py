@@ -1,4 +1,7 @@
-"""The page of the deployment on AWS, on the operator's machine: it shows, and changes nothing."""
+"""The page of a deployment on AWS, served on the operator's machine.
+
+It can change nothing in the deployment.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +28,16 @@ def serve_cloud_page(
     port: int,
     ready: Callable[[str], None],
 ) -> int:
-    """Serve the page of the deployment in *account* until a signal; return the exit code.
+    """Serve the page of the deployment in *account* until SIGTERM or SIGINT; return the exit code.
 
     Args:
-        account: Of the operator.
-        settings: Of the deployment.
-        port: On loopback; a free one if it is taken or 0.
-        ready: Called with the address that has the key.
+        account: The operator's AWS account and region.
+        settings: Settings of the deployment.
+        port: Port on loopback; a free one is used if it is 0 or taken.
+        ready: Called with the page's address, which contains a one-time key.
 
     Raises:
-        ConfigurationError: There is no deployment, or AWS refuses these credentials.
+        ConfigurationError: There is no deployment in the region, or AWS rejected the credentials.
         StoreError: AWS does not answer.
         MissingExtra: uvicorn is not installed.
     """

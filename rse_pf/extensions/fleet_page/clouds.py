@@ -1,6 +1,7 @@
-"""Versions of maps for the browser: the cloud and the trajectories, small enough to be sent and drawn.
+"""The clouds and trajectories of stored map versions, packed into a compact form for browsers.
 
-A map may come from a stranger: `packer` runs in a process with limits.
+A map may be uploaded by an untrusted robot, so that `packer` runs in a process with limited memory and CPU
+time.
 """
 
 from __future__ import annotations
@@ -27,21 +28,29 @@ if TYPE_CHECKING:
 __all__ = ["BLOCK_POINTS", "MAX_POINTS", "MapPages", "packer", "spread_order"]
 
 MAX_POINTS = 1_000_000
+"""Largest number of points of a cloud that are sent; of a larger cloud, a sample is sent."""
 BLOCK_POINTS = 50_000
-"""Points of a block; the first one is a sample of the whole cloud, which a browser draws at once."""
-_KEPT_BYTES = 32 << 20
-"""Of clouds that are ready: three of a million points."""
+"""Number of points in a block.
+
+The first block is a sample of the whole cloud, which a browser draws at once.
+"""
+# Largest number of bytes of packed clouds that are cached: three clouds with a million points.
+_CACHE_BYTES = 32 << 20
+# Memory limit of the process that packs clouds, in bytes.
 _MEMORY_BYTES = 2 << 30
+# Largest packed cloud, in bytes.
 _MAX_REPLY_BYTES = 32 << 20
+# Limit of the CPU time and of the wait for one cloud, in seconds.
 _CPU_S = 30.0
+# Largest number of maps of a tenant, and of versions of a map, that are listed.
 _MAX_LISTED = 200
 
 
 class MapPages:
-    """The maps of one platform, by name and version."""
+    """The stored maps of one platform as documents for the page: their list, and packed clouds."""
 
     def __init__(self, folder: Path) -> None:
-        """Read nothing yet; *folder* is that of the platform's state."""
+        """Describe the platform whose state is in *folder*; nothing is read."""
         self._folder = folder
         self._processes = LimitedProcesses(
             "rse_pf.extensions.fleet_page.clouds:packer",
@@ -52,9 +61,9 @@ class MapPages:
         self._preparing: asyncio.Task[None] | None = None
 
     async def maps(self) -> tuple[str, bytes]:
-        """Return the maps that have versions, newest version first, as JSON.
+        """Return media type and JSON with all maps and their versions, newest first.
 
-        The cloud that the page shows first, the newest one of the first map, is packed meanwhile.
+        Packing of the newest cloud of the first map, which the page shows first, is started as well.
         """
         listed = await asyncio.to_thread(self._maps)
         if listed and (self._preparing is None or self._preparing.done()):
@@ -62,20 +71,20 @@ class MapPages:
         return "application/json", json.dumps(listed).encode()
 
     async def cloud(self, query: Mapping[str, str]) -> tuple[str, bytes]:
-        """Return what `packer` packs of the version ``version`` of the map ``map``.
+        """Return media type and packed cloud of the map ``map`` of *query*, of ``version`` or the newest one.
 
         Raises:
-            NotFound: There is no such version.
-            RsePfError: The map cannot be read within limits.
+            NotFound: There is no such map or version.
+            RsePfError: The map is damaged, or exceeds the limits of memory and time.
         """
         return "application/octet-stream", await asyncio.to_thread(self._cloud, query)
 
     async def _prepare(self, query: Mapping[str, str]) -> None:
-        with suppress(RsePfError, OSError):  # the page is told when it asks for this cloud
+        with suppress(RsePfError, OSError):  # the page gets the error when it requests this cloud
             await asyncio.to_thread(self._cloud, query)
 
     def close(self) -> None:
-        """End the processes."""
+        """Stop the process that packs clouds."""
         self._processes.close()
 
     def _maps(self) -> list[dict[str, Any]]:
@@ -84,7 +93,7 @@ class MapPages:
         for tenant in tenants_with(store, "maps"):
             registry = MapRegistry(store, tenant)
             for name in registry.names()[:_MAX_LISTED]:
-                with suppress(RsePfError):  # a damaged map hides no other one
+                with suppress(RsePfError):  # a damaged map is left out; the other ones are listed
                     versions = [
                         {"id": record.id, "number": record.number, "points": record.points}
                         for record in reversed(registry.versions(name)[-_MAX_LISTED:])
@@ -106,15 +115,16 @@ class MapPages:
                 packed = self._processes.call(registry.data(name, version), _CPU_S)
                 self._ready[key] = packed
             self._ready.move_to_end(key)
-            while len(self._ready) > 1 and sum(map(len, self._ready.values())) > _KEPT_BYTES:
+            while len(self._ready) > 1 and sum(map(len, self._ready.values())) > _CACHE_BYTES:
                 self._ready.popitem(last=False)
         return packed
 
 
 def spread_order(count: int) -> npt.NDArray[np.int64]:
-    """Return the rows below *count* in an order whose beginning, of any length, is a sample of all.
+    """Return the rows 0 to *count* - 1 in an order of which every prefix is an even sample of all rows.
 
-    Steps of the golden ratio leave the most even gaps; neighbours in a cloud mostly are neighbours in space.
+    The stride is near the golden ratio times *count*.  Rows that follow each other in a cloud are mostly near
+    each other in space, so that a prefix is also spread over space.
     """
     import numpy as np
 
@@ -126,12 +136,14 @@ def spread_order(count: int) -> npt.NDArray[np.int64]:
 
 
 def packer(configuration: str) -> Handler:
-    """Return what packs an encoded map: a length, JSON, and blocks of points.
+    """Return the function that packs an encoded map for browsers; it runs in a process with limits.
 
-    The JSON holds ``points``, ``block``, ``robots`` (name to the positions of its keyframes, metres) and
-    ``fit`` (two corners of a box that holds nearly all points, none without points).  A block has ``block``
-    points, the last one the rest: positions as ``<u2``, then colours as bytes.  A position is
-    ``low + number * step``, by axis.  Points stand in `spread_order`.
+    A packed map is the length of a JSON header (4 bytes, little-endian), the header, and blocks of points.
+    The header holds the number of points ``points`` and that of a block ``block``, the positions (m) of the
+    keyframes of each robot in ``robots``, and in ``fit`` two corners of a box that contains nearly all points
+    (empty without points).  A block has the positions of its points as ``<u2``, then their colours as bytes
+    (RGB); the position on each axis is ``low + number * step``.  Points are in `spread_order`.
+    *configuration* is not used.
     """
     import numpy as np
 
@@ -141,7 +153,9 @@ def packer(configuration: str) -> Handler:
     def pack(data: bytes) -> bytes:
         version = decode_map(data, _MEMORY_BYTES // 2)
         order = spread_order(len(version.points))[:MAX_POINTS]
-        points = version.points.copy().take(order, axis=0)  # the map's own may lie at any address: slow
+        points = version.points.copy().take(
+            order, axis=0
+        )  # copied, since the map's array may be unaligned: slow
         colours = version.colours.take(order, axis=0)
         low = np.array([points[:, axis].min() if len(points) else 0.0 for axis in range(3)], np.float32)
         high = np.array([points[:, axis].max() if len(points) else 0.0 for axis in range(3)], np.float32)
@@ -151,7 +165,7 @@ def packer(configuration: str) -> Handler:
             place = [round(float(value), 4) for value in keyframe.T_world_camera[:3, 3]]
             robots.setdefault(printable(keyframe.robot), []).append(place)
         down = np.array([keyframe.T_world_camera[:3, 1] for keyframe in version.keyframes]).reshape(-1, 3)
-        # A few points far away, such as those of a mirror, must not make the rest small.
+        # Percentiles, so that a few distant points, such as those of a mirror, do not extend the box.
         shares = np.percentile(points, (1, 99), axis=0) if len(points) else np.empty((0, 3))
         header = {
             "fit": shares.round(4).tolist(),

@@ -32,7 +32,7 @@ _MAX_PORT = 65535
 
 @dataclass(frozen=True, kw_only=True)
 class FleetRequest:
-    """The platform whose page is shown, and whether the page may operate it."""
+    """Options of ``rse-pf fleet``: the platform whose page is shown, and whether the page may operate it."""
 
     name: str = option(
         "--name", default=_DEFAULT_NAME, help=f"name of the platform (default: {_DEFAULT_NAME})"
@@ -46,7 +46,10 @@ class FleetRequest:
 
 
 def show_page_address(request: FleetRequest, settings: PlatformSettings) -> int:
-    """Print the address; with --cloud, serve the page until a signal."""
+    """Print a new address of the running page; with --cloud, serve a page until a signal.
+
+    Return the exit code.
+    """
     if request.cloud:
         return _run_cloud(request, settings)
     if request.port is not None:

@@ -1,6 +1,7 @@
-"""What the browsers are told, once for all of them: the newest value of each key, and the last events.
+"""The messages to all open pages: the newest value of each key, and the last rows of each topic.
 
-A browser that reads slowly gets the newest values only; what it costs is bounded, whatever it does.
+A message is stored once for all pages.  A browser that reads slowly receives the newest values only, so that
+the memory for it is bounded.
 """
 
 from __future__ import annotations
@@ -16,17 +17,20 @@ from rse_pf.errors import Busy
 __all__ = ["MAX_PAGES", "Hub"]
 
 MAX_PAGES = 32
-"""Browser windows that are open at a time."""
+"""Largest number of pages (browser windows) that are open at the same time."""
+# Number of the newest rows of each topic that a new page receives.
 _KEPT = 500
-"""Rows of each topic that a new page is told."""
+# Largest number of rows that wait for a slow page; above it, the oldest rows are dropped.
 _MAX_WAITING = 2000
-"""Rows that wait for a slow page."""
+# Largest number of values that are stored; above it, the oldest value is dropped.
 _MAX_KEYS = 2048
+# Time without a message after which a page gets an empty one, in seconds, so that it sees a working
+# connection.
 _HEARTBEAT_S = 5.0
 
 
 class _Page:
-    """One open page: what waits for it."""
+    """The messages that wait for one open page: keys of changed values, and rows."""
 
     def __init__(self, topics: frozenset[str]) -> None:
         self.topics = topics
@@ -36,10 +40,13 @@ class _Page:
 
 
 class Hub:
-    """The values and rows of this process, and the pages that read them."""
+    """The values and rows of all topics, and the pages that subscribe to them.
+
+    ``refused`` counts pages that were rejected because too many were open.
+    """
 
     def __init__(self) -> None:
-        """Know nothing yet."""
+        """Start without values, rows and pages."""
         self.refused = 0
         self._values: dict[tuple[str, str], bytes] = {}
         self._rows: dict[str, deque[bytes]] = {}
@@ -47,15 +54,15 @@ class Hub:
 
     @property
     def pages(self) -> int:
-        """How many pages are open."""
+        """The number of open pages."""
         return len(self._pages)
 
     def watches(self, topic: str) -> bool:
-        """Return whether an open page wants to know of *topic*."""
+        """Return whether an open page subscribes to *topic*."""
         return any(topic in page.topics for page in self._pages)
 
     def put(self, topic: str, key: str, value: Any) -> None:
-        """Replace the value of *key* in *topic*."""
+        """Set the value of *key* in *topic*, and send it to the pages that subscribe to the topic."""
         name = (topic, key)
         self._values[name] = _message(topic, key, value)
         if len(self._values) > _MAX_KEYS:
@@ -66,7 +73,10 @@ class Hub:
                 page.woken.set()
 
     def append(self, topic: str, row: Any) -> None:
-        """Add one row to *topic*; the oldest rows are forgotten."""
+        """Add *row* to *topic*, and send it to the pages that subscribe.
+
+        Only the last 500 rows are stored.
+        """
         message = _message(topic, "", row)
         self._rows.setdefault(topic, deque(maxlen=_KEPT)).append(message)
         for page in self._pages:
@@ -75,7 +85,7 @@ class Hub:
                 page.woken.set()
 
     async def messages(self, topics: frozenset[str]) -> AsyncGenerator[bytes, None]:
-        """Yield server-sent events of *topics* for one page: all that is known, then what is new.
+        """Yield the server-sent events of *topics* for one page: stored values and rows, then new ones.
 
         Raises:
             Busy: `MAX_PAGES` pages are open already.
@@ -109,6 +119,9 @@ class Hub:
 
 
 def _message(topic: str, key: str, value: Any) -> bytes:
-    """Return one server-sent event; JSON has no line break, so that no text of a robot can end it."""
+    """Return a server-sent event as bytes.
+
+    JSON escapes line breaks, so that a robot's text cannot end the event.
+    """
     text = json.dumps({"topic": topic, "key": key, "value": value}, separators=(",", ":"), default=str)
     return f"data: {text}\n\n".encode()

@@ -1,4 +1,4 @@
-"""The page of a platform of this machine: what feeds it, and what it can ask for."""
+"""The page of a local platform: its feeds, documents and operations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ __all__ = ["serve_local_page"]
 
 
 def serve_local_page(folder: Path, *, port: int) -> int:
-    """Serve the page of the platform in *folder* until a signal; return the exit code."""
+    """Serve the page of the platform whose state is in *folder*, until a signal; return the exit code.
+
+    The page's address is printed as JSON; *port* on loopback is replaced by a free one if it is 0 or taken.
+    """
     hub = Hub()
     feed, live = LocalFeed(hub, folder), LiveFeed(hub, folder)
     maps, replays = MapPages(folder), Replays(folder)

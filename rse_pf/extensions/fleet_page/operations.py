@@ -1,4 +1,4 @@
-"""What an operator can do from the page: the operations of the control plane, by its operator's port."""
+"""The operations that an operator starts from the page, as requests to the control plane's operator port."""
 
 from __future__ import annotations
 
@@ -24,25 +24,27 @@ ACTIONS = {
     "move": ("server", "robots"),
     "roll": (),
 }
-"""Action to its parameters."""
+"""The operations, each with the names of its parameters."""
+# Longest time without an event of a running operation, in seconds.
 _SILENCE_S = 300.0
+# Last event of an operation that failed.
 _FAILED = "operation-failed"
 
 
 class LocalOperations:
-    """Operates the platform whose state is in a folder."""
+    """Executes operations of the platform whose state is in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Ask nothing yet."""
+        """Describe the platform whose state is in *folder*; nothing is requested."""
         self._folder = folder
 
     async def operate(self, action: str, parameters: Mapping[str, str]) -> Mapping[str, Any]:
-        """Do *action*, and return the last event when it is over.
+        """Execute *action*, wait until it is finished, and return its last event.
 
         Raises:
             BadRequest: There is no such action, or a parameter is missing.
-            Busy: The control plane does not answer.
-            UsageError: It refuses.
+            Busy: The control plane is not running or does not answer.
+            UsageError: The control plane rejected the request.
             CommandFailed: The operation failed.
         """
         if action not in ACTIONS or any(not parameters.get(name) for name in ACTIONS[action]):

@@ -1,4 +1,4 @@
-"""The fleet page of a local platform: its process, and new addresses of it."""
+"""Start the process of a local platform's fleet page, and request new addresses from it."""
 
 from __future__ import annotations
 
@@ -19,14 +19,20 @@ from rse_pf.local.state import control_token_file
 
 __all__ = ["new_address", "run_beside_platform", "run_page"]
 
+# File in the platform's folder with the output of the page's process.
 _LOG = "fleet_page.log"
+# Time after which a process that does not exit on SIGTERM is killed, in seconds.
 _END_S = 3.0
+# Time limit of a request for a new key, in seconds.
 _TIMEOUT_S = 5.0
 
 
 @contextlib.asynccontextmanager
 async def run_page(folder: Path, port: int, on_address: Callable[[str], None]) -> AsyncIterator[None]:
-    """Run the page of the platform in *folder*; *on_address* gets its address when it serves."""
+    """Run the page's process for the platform in *folder* inside the block.
+
+    *on_address* is called with the page's address once the page serves.
+    """
     async with run_beside_platform("rse_pf.extensions.fleet_page", folder, port, folder / _LOG, on_address):
         yield
 
@@ -35,9 +41,10 @@ async def run_page(folder: Path, port: int, on_address: Callable[[str], None]) -
 async def run_beside_platform(
     module: str, folder: Path, port: int, log_file: Path, on_address: Callable[[str], None]
 ) -> AsyncIterator[None]:
-    """Run a module in addition to the platform in *folder*; *on_address* gets the address that it prints.
+    """Run *module* as a process with the platform's *folder* inside the block; its output goes to *log_file*.
 
-    The platform is not delayed by it, and does not end with it.
+    *on_address* is called with the address that the process prints.  The platform neither waits for the
+    process nor stops when it exits.
     """
     with log_file.open("ab") as log:
         process = await asyncio.create_subprocess_exec(
@@ -60,11 +67,11 @@ async def run_beside_platform(
 
 
 def new_address(folder: Path, role: str) -> str:
-    """Return a new address of the running page, with a key for *role*, ``view`` or ``operate``.
+    """Return a new address of the running page with a one-time key for *role*, ``view`` or ``operate``.
 
     Raises:
-        UsageError: No page runs for this platform.
-        CommandFailed: It does not answer.
+        UsageError: No page is running for this platform.
+        CommandFailed: The page does not answer, or rejects the request.
     """
     try:
         port = int(json.loads((folder / ANNOUNCEMENT).read_text(encoding="utf-8"))["port"])

@@ -1,8 +1,8 @@
-"""Who may look at the page and who may operate the platform from it: one-time keys, and sessions in memory.
+"""The keys and sessions with which users view the page, or operate the platform from it.
 
-A key opens one session and is worth nothing afterwards.  Neither is ever written anywhere.  A browser keeps
-its session for one origin, port included, and sends it in a header: unlike a cookie, it reaches no other
-service of the same machine, and no other page can send it.
+A key opens one session and is invalid afterwards.  Keys and sessions are in memory only.  A browser stores
+its session for one origin, which includes the port, and sends it in a header.  Unlike a cookie, the session
+is not sent to other services of the same machine, and pages of other origins cannot send it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,12 @@ __all__ = ["KEY_LIFE_S", "MAX_SESSIONS", "PageSessions", "Role"]
 Role = Literal["view", "operate"]
 
 KEY_LIFE_S = 3600.0
+"""Time after which a key that was not used becomes invalid, in seconds."""
 MAX_SESSIONS = 32
+"""Largest number of sessions; above it, the least recently used one ends."""
+# Largest number of unused keys; above it, the oldest one becomes invalid.
 _MAX_KEYS = 64
+# A session that was not used for this long ends, in seconds.
 _IDLE_S = 12 * 3600.0
 _NEW_KEY = "get a new address with: rse-pf fleet"
 _NEW_OPERATOR_KEY = "get one with: rse-pf fleet --operate"
@@ -33,10 +37,10 @@ class _Session:
 
 
 class PageSessions:
-    """The keys that were given out, and the sessions that they opened; only digests are kept."""
+    """The unused keys, and the open sessions with their roles; only digests of both are stored."""
 
     def __init__(self, *, secret: Callable[[], str]) -> None:
-        """Know no session yet; *secret* returns a new random text each time."""
+        """Start without keys and sessions; *secret* returns a new random text at each call."""
         self._secret = secret
         self._keys: dict[bytes, tuple[Role, float]] = {}
         self._sessions: dict[bytes, _Session] = {}
@@ -50,10 +54,10 @@ class PageSessions:
         return key
 
     def open(self, key: str, *, now_s: float) -> tuple[str, Role]:
-        """Return a new session and its role for a *key*, which is used up.
+        """Open a session with *key*, which becomes invalid; return the session and its role.
 
         Raises:
-            Unauthorized: The key is unknown, was used, or is too old.
+            Unauthorized: The key is unknown, was used already, or has expired.
         """
         role = self._take_key(key, now_s)
         if role is None:
@@ -65,11 +69,11 @@ class PageSessions:
         return session, role
 
     def promote(self, session: str, key: str, *, now_s: float) -> None:
-        """Let a *session* operate, for a *key* of an operator, which is used up.
+        """Give *session* the role "operate", by an operator's *key*, which becomes invalid.
 
         Raises:
-            Unauthorized: There is no such session, or no such key.
-            Forbidden: The key is for looking only.
+            Unauthorized: There is no such session, or the key is not valid.
+            Forbidden: The key is for the role "view".
         """
         self.role_of(session, now_s=now_s)
         role = self._take_key(key, now_s)
@@ -80,7 +84,10 @@ class PageSessions:
         self._sessions[_digest(session)].role = "operate"
 
     def role_of(self, session: str, *, now_s: float) -> Role:
-        """Return what a *session* may do; raises Unauthorized if there is none."""
+        """Return the role of *session*, and extend its life.
+
+        Raises Unauthorized if it does not exist or expired.
+        """
         entry = self._sessions.get(_digest(session))
         if entry is not None and now_s - entry.used_s > _IDLE_S:
             del self._sessions[_digest(session)]
@@ -91,7 +98,7 @@ class PageSessions:
         return entry.role
 
     def check_operator(self, session: str, *, now_s: float) -> None:
-        """Raise Forbidden if a *session* may only look, Unauthorized if there is none."""
+        """Raise Forbidden if the role of *session* is "view", Unauthorized if there is no such session."""
         if self.role_of(session, now_s=now_s) != "operate":
             raise Forbidden("only an operator may do this", hint=_NEW_OPERATOR_KEY)
 
@@ -101,5 +108,5 @@ class PageSessions:
 
 
 def _digest(text: str) -> bytes:
-    """Return the digest by which a secret is looked up, so that no comparison of it takes a telling time."""
+    """Return the SHA-256 by which a secret is looked up, so that the look-up's time reveals nothing of it."""
     return hashlib.sha256(text.encode("utf-8", "replace")).digest()

@@ -1,7 +1,7 @@
-"""The replay of one command of the Poses view: found in the platform's recording, and solved again.
+"""The replay of one command of the Poses view: it is found in the platform's recording and solved again.
 
-Everything that reads the recording runs in a process with limits
-(`rse_pf.extensions.recording.replay.limited`)."""
+The recording is read in a process with limits only (`rse_pf.extensions.recording.replay.limited`).
+"""
 
 from __future__ import annotations
 
@@ -23,28 +23,32 @@ if TYPE_CHECKING:
 
 __all__ = ["Replays", "replay_document"]
 
+# Longest time until an answered command is written to the recording, in seconds.
 _WRITTEN_S = 2.0
-"""A command is in the file after this time at the latest."""
+# Largest image of a replay that is sent to the page, in bytes.
 _MAX_PICTURE_BYTES = 2 << 20
 
 
 class Replays:
-    """Answers for one platform; one replay runs at a time."""
+    """Replays commands of one platform for the page, one at a time."""
 
     def __init__(self, folder: Path, *, wall_clock: Callable[[], float] = time.time) -> None:
-        """Start nothing; *folder* is that of the platform's state."""
+        """Describe the platform whose state is in *folder*; no process is started."""
         self._folder = folder
         self._wall_clock = wall_clock
         self._replay: LimitedReplay | None = None
         self._lock = asyncio.Lock()
 
     async def page(self, query: Mapping[str, str]) -> tuple[str, bytes]:
-        """Return the replay of the command with ``trace`` and ``id`` as JSON.
+        """Return media type and JSON of the replay of a command.
+
+        *query* names the command by ``trace`` and ``id``; ``time_s`` (Unix) is the time of its answer and
+        ``bytes`` its size, both of which help to find it.
 
         Raises:
-            NotFound: The platform records nothing, or not this command.
-            Busy: Another replay is under way.
-            BadRequest: The id is no number, or the recording cannot be read.
+            NotFound: The platform has no recording, or the command is not in it.
+            Busy: Another replay is running.
+            BadRequest: ``id`` or ``time_s`` is no number, or the recording cannot be read.
         """
         trace, identity, time_s = query.get("trace", ""), query.get("id", ""), query.get("time_s", "0")
         if not (identity.isascii() and identity.isdigit() and len(identity) < 17 and len(trace) <= 200):
@@ -67,7 +71,7 @@ class Replays:
         return "application/json", json.dumps(reply).encode()
 
     def close(self) -> None:
-        """End the process with limits."""
+        """Stop the process that reads the recording, if it runs."""
         if self._replay is not None:
             self._replay.close()
 
@@ -95,7 +99,10 @@ class Replays:
 
 
 def replay_document(report: CommandReport) -> dict[str, Any]:
-    """Return what the page shows of *report*, every text escaped."""
+    """Return the members that the page shows of *report*: command, ``equal``, lines and picture.
+
+    Texts are escaped.
+    """
     picture = report.picture_png if len(report.picture_png) <= _MAX_PICTURE_BYTES else b""
     reason = f": {report.reason}" if report.reason else ""
     tried = (*report.engines, *report.options)

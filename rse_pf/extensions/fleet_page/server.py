@@ -1,4 +1,4 @@
-"""Run the page: one process on loopback, which announces its port and ends with its parent."""
+"""Run the server of the page: one process that listens on loopback and writes its port to a file."""
 
 from __future__ import annotations
 
@@ -27,21 +27,27 @@ from rse_pf.storage.files import replace_json
 __all__ = ["ANNOUNCEMENT", "listen", "page_url", "serve_page"]
 
 ANNOUNCEMENT = "fleet_page.json"
-"""Beside the platform's state: pid and port of its page."""
+"""Name of the file with pid and port of the page, in the folder of the platform's state."""
 _LOOPBACK = "127.0.0.1"
+# Largest number of connections that have sent no request yet, and the same of idle ones after a request.
 _MAX_SILENT = 2 * MAX_PAGES
-"""Connections that have sent no request, and as many that wait for the next one."""
+# Largest number of all connections.
 _MAX_CONNECTIONS = 4 * MAX_PAGES + 2 * _MAX_SILENT
+# Longest wait for open requests when the server stops, in seconds.
 _LONGEST_END_S = 1
 
 
 def page_url(port: int, key: str) -> str:
-    """Return the address of the page; browsers send what follows ``#`` to nobody."""
+    """Return the address of the page with *key* after ``#``, a part that browsers do not send to servers."""
     return f"http://{_LOOPBACK}:{port}/#key={key}"
 
 
 def listen(port: int) -> socket.socket:
-    """Return a socket on loopback at *port*, or at a free one if that is taken or 0."""
+    """Return a listening socket on loopback at *port*, or at a free port if *port* is 0 or taken.
+
+    Raises:
+        ConfigurationError: No port is free.
+    """
     for candidate in (port, 0):
         with contextlib.suppress(OSError):
             return socket.create_server((_LOOPBACK, candidate), backlog=BACKLOG)
@@ -57,16 +63,18 @@ def serve_page(
     platform: Path | None,
     ready: Callable[[str], None],
 ) -> int:
-    """Serve until SIGTERM or SIGINT; return the exit code.
+    """Serve the page until SIGTERM or SIGINT; return the exit code.
 
     Args:
-        hub: What is told to browsers.
-        actions: What browsers can ask for.
-        listening: Socket on loopback.
-        works: Returns what feeds the hub, to be run beside.
-        platform: Folder of the local platform: its control token lets further keys be made, and a file in it
-            has pid and port until the end; None for a deployment, which has neither.
-        ready: Called with the address that has the first key.
+        hub: The messages of the stream.
+        actions: The operations and documents that browsers request.
+        listening: The listening socket on loopback.
+        works: Returns the coroutines that feed the hub; they run while the page is served.
+        platform: Folder of a local platform's state.  Who knows its control token may request keys, and pid
+            and port
+            are in a file of the folder while the page is served.  None for a deployment on AWS, which has
+            neither.
+        ready: Called with the page's address, which contains the first key.
 
     Raises:
         MissingExtra: uvicorn is not installed.
@@ -92,7 +100,9 @@ def serve_page(
         timeout_graceful_shutdown=_LONGEST_END_S, h11_max_incomplete_event_size=16384,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, frame: None)  # uvicorn repeats it to itself when it has ended
+        signal.signal(
+            number, lambda number, frame: None
+        )  # uvicorn raises the signal again after it has stopped
 
     async def run() -> None:
         server = uvicorn.Server(config)

@@ -1,4 +1,4 @@
-"""The files of the page, read once at the start; nothing else is ever served."""
+"""The static files of the page, which are read once at the start; no other file is served."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 __all__ = ["STATIC", "StaticFile", "page_files", "vendored"]
 
 STATIC = Path(__file__).parent / "static"
+# Media types of the files that are served, by suffix; files with other suffixes are not served.
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -22,7 +23,7 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class StaticFile:
-    """One file as it is sent."""
+    """One file with its media type and its ETag, which is a hash of its content."""
 
     media_type: str
     data: bytes
@@ -30,7 +31,7 @@ class StaticFile:
 
 
 def page_files() -> dict[str, StaticFile]:
-    """Return the files of the page by path; ``/`` is its beginning."""
+    """Return the files of the page by URL path; ``/`` is ``index.html``."""
     files = {
         f"/{file.relative_to(STATIC).as_posix()}": _read(file)
         for file in sorted(STATIC.rglob("*"))
@@ -40,7 +41,7 @@ def page_files() -> dict[str, StaticFile]:
 
 
 def vendored() -> list[Mapping[str, Any]]:
-    """Return the packages of others that the page contains: version, licence, and the digest of each file."""
+    """Return the third-party packages in the page: version, licence, and the digest of each file."""
     packages: list[Mapping[str, Any]] = json.loads((STATIC / "vendor" / "vendored.json").read_text("utf-8"))
     return packages
 

@@ -1,6 +1,7 @@
-"""The maps of all tenants of one local platform, each under one label: NAME, or TENANT/NAME.
+"""The maps of all tenants of one local platform, each with a label: NAME, or TENANT/NAME.
 
-The label of a map of the default tenant is its name.  Tenants whose names are no plain folder are left out.
+The label of a map of the default tenant is its name.  Tenants whose names cannot be names of folders are left
+out.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["map_label", "platform_store", "split_label", "tenants_with"]
 
-# Tenants whose maps are shown, besides the default one: the page has one connection for each.
+# Largest number of tenants whose maps are shown, besides the default one: each needs a connection of the
+# page.
 _MAX_TENANTS = 32
 
 
@@ -28,17 +30,17 @@ def platform_store(folder: Path) -> ObjectStore:
 
 
 def tenants_with(store: ObjectStore, kind: str) -> list[str]:
-    """Return the default tenant, and the others that have something in the folder *kind*.  Blocking."""
+    """Return the default tenant, and at most 32 others that have objects in the folder *kind*; blocking."""
     others = sorted(set(store.folders(f"{kind}/")) - {DEFAULT_TENANT})
     return [DEFAULT_TENANT, *[each for each in others if name_segment(each) == each][:_MAX_TENANTS]]
 
 
 def map_label(tenant: str, name: str) -> str:
-    """Return the label of the map *name*."""
+    """Return the label of the map *name* of *tenant*."""
     return name if tenant == DEFAULT_TENANT else f"{tenant}/{name}"
 
 
 def split_label(label: str) -> tuple[str, str]:
-    """Return tenant and name of a map; no name of a map has a slash."""
+    """Return tenant and name of the map with *label*; names of maps contain no slash."""
     tenant, _, name = label.rpartition("/")
     return tenant or DEFAULT_TENANT, name

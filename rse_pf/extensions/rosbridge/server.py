@@ -98,7 +98,7 @@ class _Clients:
             self._silent.leave(connection)
 
     def _source(self, connection: ServerConnection, request: Request) -> str:
-        """Return the IP address of a client, from ``X-Forwarded-For`` if a load balancer is configured."""
+        """Return a client's IP address; behind trusted proxies, it is taken from ``X-Forwarded-For``."""
         forwarded = ",".join(request.headers.get_all("X-Forwarded-For"))
         return self._rates.source(str(connection.remote_address[0]), forwarded)
 

@@ -1,4 +1,4 @@
-"""What the page knows, and where it reads it: the control plane, servers, logs, live maps.
+"""The feeds of the page: they read the control plane, servers, logs, live maps or AWS, and fill the hub.
 
-What browsers may ask for and do belongs to the package above.
+Requests of browsers are handled in the package above.
 """

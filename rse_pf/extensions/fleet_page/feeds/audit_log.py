@@ -1,6 +1,6 @@
-"""Entries of a local platform's audit log as they are written, in words.
+"""Read new entries of a local platform's audit logs, and describe each as a sentence.
 
-A line that is not an entry is left out.  The text in entries may come from robots: it is escaped here.
+A line that is no valid entry is ignored.  Texts in entries may come from robots, and are escaped here.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ from rse_pf.terminal import printable
 __all__ = ["PLATFORM", "AuditRows", "audit_sentence"]
 
 PLATFORM = "platform."
-"""Entries of this kind are the control plane's events."""
+"""Prefix of the actions of entries that are events of the control plane."""
+# Largest number of entries that are shown after one reading; of more, the newest are shown.
 _MAX_ROWS = 200
+# Largest number of characters of a sentence.
 _MAX_TEXT = 300
 
 
 class AuditRows:
-    """Reads what is appended to the logs of one platform, and first the end of what is there."""
+    """Reads the audit logs of one platform: at first their last lines, then what is appended."""
 
     def __init__(self, folder: Path) -> None:
-        """Read nothing yet; *folder* is that of the platform's state."""
+        """Describe the platform whose state is in *folder*; nothing is read."""
         self._folder = audit_folder(folder)
         self._tail = FileTail()
         self.skipped = 0
-        """Entries that came faster than they are shown."""
+        """Number of entries that were not shown, because one reading found more than 200."""
 
     def new_entries(self) -> list[tuple[str, Entry]]:
-        """Return the name of the log and the entry of what was written since the last call, oldest first."""
+        """Return the entries written since the last call, each with the name of its log, oldest first."""
         entries: list[tuple[str, Entry]] = []
         files = sorted(self._folder.glob("*.jsonl")) if self._folder.is_dir() else []
         for file in files:
@@ -47,10 +49,12 @@ class AuditRows:
     def new_rows(
         self, is_reported: Callable[[Entry], bool] = lambda entry: False
     ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Return what the Events view shows of new entries, and the platform's events among them.
+        """Return the rows of the Events view for new entries, and the control plane's events among them.
 
         Args:
-            is_reported: Whether an event was reported already; it is then left out.
+            is_reported: Returns whether an event of the control plane was reported in another way; such an
+                event is
+                left out.
         """
         rows: list[dict[str, Any]] = []
         events: list[dict[str, Any]] = []
@@ -64,7 +68,10 @@ class AuditRows:
 
 
 def audit_sentence(who: str, entry: Entry) -> str:
-    """Return an *entry* of the log *who* as a sentence; its details if its action has none of its own."""
+    """Return *entry* of the log named *who* as a sentence.
+
+    An action without a sentence in `_SENTENCES` is described by its name, subject and details.
+    """
     values = {name: str(value) for name, value in entry.detail.items()}
     subject = str(RobotId(values["tenant"], entry.subject)) if values.get("tenant") else entry.subject
     actor = values.get("user", entry.actor) if entry.actor == OPERATOR else entry.actor
@@ -79,7 +86,7 @@ def audit_sentence(who: str, entry: Entry) -> str:
 
 
 def _claim(values: Mapping[str, str]) -> str:
-    """Return which robot a token that was refused names, as the part of a sentence; empty if none."""
+    """Return the part of a sentence with the robot that a rejected token names; empty if it names none."""
     robot, tenant = values.get("claimed_robot"), values.get("claimed_tenant")
     if not robot:
         return ""
@@ -98,6 +105,7 @@ class _Missing(dict[str, str]):
         return "-"
 
 
+# The sentence for each action of an entry; names in braces are members of the entry.
 _SENTENCES: Mapping[str, str] = {
     "auth.accepted": "{who} accepted {subject} from {source} (token {token})",
     "auth.cut-off": "{who} ended the connection of {subject}: {reason}",
@@ -109,7 +117,7 @@ _SENTENCES: Mapping[str, str] = {
     "map.remove": "{actor} removed version {number} of the map {subject}",
     "map.restore": "{actor} restored the map {subject}, with version {number} as its head",
     "map.head": "{actor} made version {number} the head of the map {subject}",
-    "robot.adopted": "{actor} gave {subject} what its earlier key stored",
+    "robot.adopted": "{actor} gave {subject} the objects that its earlier key stored",
     "robot.disabled": "{actor} disabled {subject}",
     "robot.enabled": "{actor} enabled {subject} again",
     "robot.enrolled": "{actor} enrolled {subject}, which may use {scopes}",
@@ -117,11 +125,11 @@ _SENTENCES: Mapping[str, str] = {
     "robot.removed": "{actor} removed {subject}",
     "server.drain": "{who} drains: its robots are asked to move after {wait_s} s",
     "server.move": "{who} asks {robots} of its robots to move within {spread_s} s",
-    "server.over": "{who} has ended",
+    "server.over": "{who} has exited",
     "server.ready": "{who} is ready",
     "server.robot-shut-out": "{who} refuses {robot} for {seconds} s: its bytes ended two processes",
-    "server.services": "{who} loads its services anew",
-    "server.unblock": "{who} lifts {lifted} blocks of robots and services",
+    "server.services": "{who} reloads its services",
+    "server.unblock": "{who} removed {lifted} blocks of robots and services",
     "server.worker-crashed": "a worker of {who} ended by signal {signal}, when it computed for {robot}",
     "tenant.quota": "{actor} let the tenant {subject} store {data_bytes} bytes",
     "token.issued": "{actor} issued the token {token} for {subject}",

@@ -1,6 +1,7 @@
-"""What the page knows of the deployment on AWS: read with the operator's credentials, while somebody looks.
+"""The feed of the page of a deployment on AWS, which it reads with the operator's credentials.
 
-Nothing is changed in the account, and no port of it is opened.  What AWS does not tell is said in words.
+It reads only while a page is open, changes nothing in the account, and opens no port there.  The page lists
+the data that AWS does not provide.
 """
 
 from __future__ import annotations
@@ -25,24 +26,32 @@ from rse_pf.terminal import printable
 
 __all__ = ["CloudFeed", "cloud_document", "new_events"]
 
+# Time between two readings of the group's state, in seconds.
 _STATE_EVERY_S = 10.0
-_TELL_EVERY_S = 3.0
-_LOOK_S = 0.25
+# Time between two messages to the pages about the connection to AWS, in seconds.
+_PUBLISH_LINK_EVERY_S = 3.0
+# Time between two checks whether a page is open, in seconds.
+_CHECK_PAGES_S = 0.25
+# Largest number of characters of a text.
 _MAX_TEXT = 300
+# Number of the newest periods that may lack a CPU value, because CloudWatch publishes it late.
 _LATE_PERIODS = 2
+# Exceptions that the parsing of an unexpected answer of AWS raises.
 _NOT_UNDERSTOOD = (LookupError, TypeError, ValueError)
-_NOT_TOLD = (
+# Sentences about data that AWS does not provide, for the page.
+_UNAVAILABLE = (
     "Commands, queue and wait are published for the whole group, not for each server",
     "robots are counted, not named; weak poses, events of the servers and live maps stay on the servers",
     "audit entries: rse-pf audit show --cloud",
 )
+# Lifecycle states of an instance in the Auto Scaling group, in the words of the local platform.
 _STATES = {"InService": "starting", "Pending": "starting", "Terminating": "draining", "Terminated": "gone"}
 
 T = TypeVar("T")
 
 
 class CloudFeed:
-    """Feeds a `Hub` with what one deployment does."""
+    """Puts state, metrics and events of one deployment into a `Hub`."""
 
     def __init__(
         self,
@@ -53,14 +62,14 @@ class CloudFeed:
         *,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
-        """Read nothing yet.
+        """Publish the events of *first*; `run` reads and publishes everything else.
 
         Args:
-            hub: What is told.
-            account: Whose deployment.
-            settings: Of the platform.
-            first: The state that was read before, to see whether the credentials are good.
-            wall_clock: Unix seconds.
+            hub: The hub of the page.
+            account: The account with the deployment.
+            settings: Settings of the deployment.
+            first: The state that was read before, as a check of the credentials.
+            wall_clock: Returns Unix seconds.
         """
         self._hub = hub
         self._account = account
@@ -73,7 +82,7 @@ class CloudFeed:
             hub.append("event", event)
 
     async def run(self) -> None:
-        """Feed until cancelled, at first with the state that was read before."""
+        """Publish the first state, then read and publish while a page is open, until cancelled."""
         self._publish()
         works: list[Coroutine[Any, Any, None]] = [
             self._repeat(_STATE_EVERY_S, self._read_state),
@@ -85,7 +94,7 @@ class CloudFeed:
     async def _repeat(self, every_s: float, read: Callable[[], Coroutine[Any, Any, None]]) -> None:
         while True:
             while not self._hub.watches("fleet"):
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(_CHECK_PAGES_S)
             await read()
             self._publish()
             await asyncio.sleep(every_s)
@@ -93,7 +102,7 @@ class CloudFeed:
     async def _publish_periodically(self) -> None:
         while True:
             self._publish_link()
-            await asyncio.sleep(_TELL_EVERY_S)
+            await asyncio.sleep(_PUBLISH_LINK_EVERY_S)
 
     async def _read_state(self) -> None:
         now = self._now()
@@ -115,13 +124,16 @@ class CloudFeed:
             self._hub.put("history", "minutes", _history(read))
 
     async def _read_in_thread(self, subject: str, read: Callable[[], T]) -> T | None:
-        """Return what *read* returns in a thread; None, and a problem under *subject*, when AWS refuses."""
+        """Call *read* in a thread and return its result.
+
+        After an error return None, and store the error under *subject* for the page.
+        """
         try:
             value = await asyncio.to_thread(read)
         except RsePfError as error:
             self._problems[subject] = f"{error.message} ({error.hint})"
             return None
-        except _NOT_UNDERSTOOD as error:  # the page shows what the other answers say
+        except _NOT_UNDERSTOOD as error:  # the page shows the data of the other answers
             self._problems[subject] = f"AWS answers in a way that is not understood: {error}"
             return None
         self._problems.pop(subject, None)
@@ -155,14 +167,16 @@ def cloud_document(
     time_s: float,
     region: str = "",
 ) -> dict[str, Any]:
-    """Return what the Fleet view shows of a deployment, every text escaped; what is unknown is None.
+    """Return the document that the Fleet view shows for a deployment.
+
+    Texts are escaped, unknown values are None.
 
     Args:
-        overview: Its state.
-        metrics: Its numbers.
-        settings: Of the platform.
-        time_s: Unix seconds.
-        region: Of the deployment.
+        overview: The state of the deployment.
+        metrics: The metrics of the deployment.
+        settings: Settings of the deployment.
+        time_s: The present time, Unix seconds.
+        region: AWS region of the deployment.
     """
     group, balancer, period_s = overview.group, overview.balancer, metrics.period_s
     servers = [_server(server, overview, metrics, time_s) for server in group.servers]
@@ -173,7 +187,7 @@ def cloud_document(
         name: _round(_divide(metrics.newest(name), period_s), 2)
         for name in ("requests", "bytes_in", "bytes_out")
     }
-    unknown = [*_NOT_TOLD, *overview.problems]
+    unknown = [*_UNAVAILABLE, *overview.problems]
     if len(robots) < len(servers):
         unknown.insert(0, f"{len(servers) - len(robots)} of {len(servers)} servers did not tell their robots")
     return {
@@ -208,7 +222,11 @@ def cloud_document(
 
 
 def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: float) -> list[dict[str, Any]]:
-    """Return what happened between two looks, as the Events view shows it; all that is known at the first."""
+    """Return rows of the Events view for the changes between two readings.
+
+    They are scaling activities, alarms, and servers that changed or left.  At the first reading, *before* is
+    None, and the rows are all known activities and the alarms in state ALARM.
+    """
     old_activities = (
         set() if before is None else {(activity.id, activity.status) for activity in before.activities}
     )
@@ -232,7 +250,9 @@ def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: fl
     return events
 
 
+# Protocols of listeners that encrypt.
 _SECURE = {"TLS", "HTTPS"}
+# Alarms that add or remove servers; all others are about trouble.
 _SCALES = ("busy", "idle", "crowded", "underused")
 
 
@@ -282,7 +302,7 @@ def _server(server: Server, overview: CloudOverview, metrics: GroupMetrics, time
 
 
 def _state(server: Server) -> str:
-    """Return the state of a server in the words of the local platform."""
+    """Return the state of an instance in the words of the local platform, such as "healthy" or "draining"."""
     phase = server.state.partition(":")[0]
     if phase != "InService":
         return _STATES.get(phase, server.state)
@@ -294,13 +314,16 @@ def _state(server: Server) -> str:
 def _list_wait_reasons(
     group: AutoScalingGroup, metrics: GroupMetrics, settings: PlatformSettings
 ) -> list[str]:
-    """Return what the alarms wait for: they are the same policy as that of a local platform."""
+    """Return sentences about when the alarms will add or remove servers, and about alarms in state ALARM.
+
+    The alarms implement the same policy as the scale modifier of a local platform.
+    """
     pairs = list(zip(metrics.series.get("cpu_percent", ()), metrics.series.get("requests", ()), strict=False))
     while pairs and pairs[-1][0] is None and len(metrics.times_s) - len(pairs) < _LATE_PERIODS:
-        pairs.pop()  # it comes a minute or two late
+        pairs.pop()  # CloudWatch publishes CPU values a minute or two late
     samples: list[dict[str, float]] = []
     for cpu, requests in pairs:
-        # A period without a number breaches no alarm, so that the count begins anew.
+        # A period without a value does not breach an alarm, so that the count of breaching periods restarts.
         samples = [] if cpu is None else [*samples, {"cpu_percent": cpu, "requests": requests or 0.0}]
     policy = {
         "elastic": True, "samples": samples,
@@ -317,7 +340,7 @@ def _list_wait_reasons(
 
 
 def _history(metrics: GroupMetrics) -> list[list[float | None]]:
-    """Return time, CPU, commands a second, robots and p99 of each period; robots are not charted."""
+    """Return the columns of the charts: time, CPU (%), commands per second, robots (all None), p99 (ms)."""
     series, count = metrics.series, len(metrics.times_s)
     nothing: tuple[float | None, ...] = (None,) * count
     rates = [_round(_divide(count, metrics.period_s), 2) for count in series.get("requests", nothing)]

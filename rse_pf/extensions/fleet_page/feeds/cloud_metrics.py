@@ -1,6 +1,6 @@
-"""Read the metrics of the group and of its servers over the last periods, in one request to CloudWatch.
+"""Read the metrics of the Auto Scaling group and of its servers over the last periods from CloudWatch.
 
-AWS charges 0.01 USD for 1000 metrics of such requests.  A number that nobody published is None, never zero.
+AWS charges 0.01 USD for 1000 requested metrics.  A value that was not published is None, never zero.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from rse_pf.scaling.alarms import NAMESPACE
 
 __all__ = ["PERIODS", "GroupMetrics", "read_group_metrics"]
 
-# Periods of a graph: an hour of one-minute samples.
+# Number of periods in a chart: an hour of one-minute samples.
 PERIODS = 60
-# A number that is older than this many periods is shown as unknown.
+# A value that is older than this many periods is shown as unknown.
 _FRESH_PERIODS = 3
-# Servers of one request, two metrics each: GetMetricData takes 500 queries.
+# Largest number of servers whose metrics are requested, two for each: GetMetricData accepts 500 queries.
 _MAX_SERVERS = 200
 _EC2 = "AWS/EC2"
+# Metrics of the group by our name: namespace, name and statistic in CloudWatch.
 _GROUP_SERIES = {
     "cpu_percent": (_EC2, "CPUUtilization", "Average"),
     "requests": (NAMESPACE, "Requests", "Sum"),
@@ -36,6 +37,7 @@ _GROUP_SERIES = {
     "p99_ms": (NAMESPACE, "AnswerMs", "p99"),
     "answers": (NAMESPACE, "AnswerMs", "SampleCount"),
 }
+# Metrics of each server, in the same form.
 _SERVER_SERIES = {
     "cpu_percent": (_EC2, "CPUUtilization", "Average"),
     "robots": (NAMESPACE, ROBOTS, "Maximum"),
@@ -44,10 +46,10 @@ _SERVER_SERIES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroupMetrics:
-    """Numbers of the last `PERIODS` complete periods of ``period_s`` seconds.
+    """Metrics of the last `PERIODS` complete periods of ``period_s`` seconds.
 
-    ``times_s`` are the ends of the periods in Unix seconds; ``series`` maps a name to one number for each of
-    them.  ``servers`` maps an instance to its newest numbers, of the last three periods.
+    ``times_s`` are the ends of the periods in Unix seconds; ``series`` maps the name of a metric to its value
+    in each period.  ``servers`` maps an instance to its newest values within the last three periods.
     """
 
     period_s: int
@@ -56,7 +58,10 @@ class GroupMetrics:
     servers: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def newest(self, name: str) -> float | None:
-        """Return the newest number of a series, if it is of the last three periods."""
+        """Return the newest value of the metric *name* within the last three periods.
+
+        None if there is none.
+        """
         values = [value for value in self.series.get(name, ())[-_FRESH_PERIODS:] if value is not None]
         return values[-1] if values else None
 
@@ -64,12 +69,12 @@ class GroupMetrics:
 def read_group_metrics(
     account: Account, settings: PlatformSettings, servers: Sequence[str], *, now: datetime
 ) -> GroupMetrics:
-    """Return the numbers of the group and of *servers* until *now*, in UTC.
+    """Return the metrics of the group and of the instances *servers* until *now* (UTC).
 
-    The current period is left out: some agents may not have published theirs yet.
+    The current period is left out, since some servers may not have published their values yet.
 
     Raises:
-        ConfigurationError: AWS refused.
+        ConfigurationError: AWS rejected the request.
         StoreError: AWS does not answer.
     """
     period_s, group = settings.scaling.period_s, ResourceNames(settings.cloud.name).group

@@ -1,7 +1,7 @@
 """Read the state of a deployment on AWS: the group, its load balancer, and its last scaling activities.
 
-Nothing is changed, and AWS charges for none of these calls.  Only the group must be readable; each other
-part that AWS refuses is a sentence in `CloudOverview.problems`.
+The calls change nothing, and AWS does not charge for them.  Reading the group must succeed; an error of
+another part becomes a sentence in `CloudOverview.problems`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ from rse_pf.errors import RsePfError
 
 __all__ = ["CloudBalancer", "CloudOverview", "ScalingActivity", "read_overview"]
 
-# Newest scaling activities that are read: one page of the answer, hours of a busy group.
+# Number of the newest scaling activities that are read: one page of the answer, the last hours of a busy
+# group.
 _MAX_ACTIVITIES = 50
-# AWS takes at most this many values in one filter.
+# AWS accepts at most this many values in one filter.
 _MAX_FILTER_VALUES = 200
+# Final states of a scaling activity that was not carried out.
 _FAILED = ("Failed", "Cancelled")
 
 T = TypeVar("T")
@@ -30,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudBalancer:
-    """The load balancer: its ``state``, its ``address``, and the protocols of its listeners."""
+    """The load balancer: its state as AWS names it, its DNS name, and the protocols of its listeners."""
 
     state: str
     address: str
@@ -39,7 +41,7 @@ class CloudBalancer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScalingActivity:
-    """One launch or termination of a server, done or tried; ``began_s`` is in Unix seconds."""
+    """One launch or termination of a server, completed or not; ``began_s`` is in Unix seconds."""
 
     id: str
     began_s: float
@@ -49,16 +51,17 @@ class ScalingActivity:
 
     @property
     def has_failed(self) -> bool:
-        """Whether it failed or was cancelled."""
+        """Whether the activity failed or was cancelled."""
         return self.status in _FAILED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudOverview:
-    """A deployment at one moment.
+    """The state of a deployment at one time.
 
-    ``launched_s`` maps an instance to the Unix seconds of its launch; ``activities`` are the newest, oldest
-    first; ``problems`` say what could not be read.
+    ``balancer`` is None if the group has none or it could not be read.  ``launched_s`` maps an instance to
+    the time of its launch (Unix seconds); ``activities`` are the newest scaling activities, oldest first;
+    ``problems`` are sentences about parts that could not be read.
     """
 
     group: AutoScalingGroup
@@ -69,10 +72,10 @@ class CloudOverview:
 
 
 def read_overview(account: Account, settings: PlatformSettings, *, now: datetime) -> CloudOverview:
-    """Return the state of the deployment at *now*, in UTC, without the robots.
+    """Return the state of the deployment at *now* (UTC), without its robots.
 
     Raises:
-        ConfigurationError: There is no group in the region, or AWS refuses to describe it.
+        ConfigurationError: There is no group in the region, or AWS does not allow to describe it.
         StoreError: AWS does not answer.
     """
     group = read_group(account, settings, now=now, asks_robots=False)
@@ -118,7 +121,7 @@ def _read_balancer(account: Account, target_groups: tuple[str, ...]) -> CloudBal
 def _read_launch_times_s(account: Account, names: list[str]) -> dict[str, float]:
     if not names:
         return {}
-    # By a filter: an id that is gone would be an error.
+    # A filter is used, since an InstanceId parameter with the id of a terminated instance would be an error.
     rows = account.pages(
         "ec2",
         "describe_instances",

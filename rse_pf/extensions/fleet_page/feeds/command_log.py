@@ -1,6 +1,6 @@
-"""Weak and failed commands as they come, from the logs that the servers of a local platform write anyway.
+"""Read new weak and failed commands from the logs of a local platform's servers.
 
-Only the lines about commands are read.  The text in them may come from robots: it is escaped here.
+Only the lines about commands are parsed.  Texts in them may come from robots, and are escaped here.
 """
 
 from __future__ import annotations
@@ -14,27 +14,31 @@ from rse_pf.terminal import printable
 
 __all__ = ["CommandLog"]
 
+# Lines without these bytes are about other events, and are not parsed.
 _MARK = b'"command"'
+# Members of a line that are shown.
 _FIELDS = (
     "robot", "service", "id", "trace", "code", "verdict", "reason", "queue_ms", "compute_ms", "bytes_in",
     "server",
 )  # fmt: skip
+# Largest number of characters of a text.
 _MAX_TEXT = 200
+# Largest number of commands that are shown after one reading; of more, the newest are shown.
 _MAX_ROWS = 200
 
 
 class CommandLog:
-    """Reads what is appended to the logs of a folder, and first the end of what is there."""
+    """Reads the logs of the servers in a folder: at first their last lines, then what is appended."""
 
     def __init__(self, folder: Path) -> None:
-        """Read nothing yet."""
+        """Describe the folder of the logs; nothing is read."""
         self._folder = folder
         self._tail = FileTail()
         self.skipped = 0
-        """Lines that came faster than they are shown."""
+        """Number of commands that were not shown, because one reading found more than 200."""
 
     def new_rows(self) -> list[dict[str, Any]]:
-        """Return the commands that were written since the last call, oldest first."""
+        """Return the weak and failed commands that were logged since the last call, oldest first."""
         rows: list[dict[str, Any]] = []
         for file in sorted(self._folder.glob("server-*.log")):
             rows += self._rows_of(file)
@@ -48,7 +52,11 @@ class CommandLog:
 
 
 def _row(line: bytes) -> dict[str, Any] | None:
-    """Return what is shown of one line; None if it tells of no weak or failed command."""
+    """Return the row of the Poses view for a log line.
+
+    None if the line is not about a weak or failed command.
+    Commands with the codes busy and stale are no failures here.
+    """
     if _MARK not in line:
         return None
     try:

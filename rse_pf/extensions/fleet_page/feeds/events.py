@@ -1,4 +1,4 @@
-"""The events of a platform of one machine: what each means in words, its group and its level; pure.
+"""The events of a local platform: the sentence, the group (filter of the page) and the log level of each.
 
 Events come from the control plane, from backend servers and from map servers.
 """
@@ -12,11 +12,14 @@ from rse_pf.identity import DEFAULT_TENANT
 
 __all__ = ["EVENTS", "event_sentence", "group_of", "level_of"]
 
+# An event whose kind contains one of these words is in the group "trouble".
 _TROUBLE = (
     "gone", "failed", "unhealthy", "crash", "silent", "down", "taken", "not-", "lost", "disk-full",
     "disk-low",
 )  # fmt: skip
+# An event whose kind begins with one of these is in the group "fault".
 _FAULT = ("server-killed", "server-paused", "server-resumed", "balancer-killed", "fault")
+# Kinds of events in the group "scaling".
 _SCALING = frozenset(
     (
         "grow", "shrink", "replace", "drain-start", "drain-over", "roll-settings", "roll-step",
@@ -26,9 +29,9 @@ _SCALING = frozenset(
 
 
 def event_sentence(event: Mapping[str, Any]) -> str:
-    """Return *event* as a sentence; its kind and details if it has none of its own.
+    """Return *event* as a sentence; a kind without a sentence in `EVENTS` gives its kind and details.
 
-    Robots and maps of another tenant than the default one are shown as TENANT/NAME.
+    Robots and maps of another tenant than the default one are named TENANT/NAME.
     """
     kind = str(event.get("event", ""))
     text = EVENTS.get(kind)
@@ -47,7 +50,10 @@ def event_sentence(event: Mapping[str, Any]) -> str:
 
 
 def group_of(kind: str) -> str:
-    """Return the filter under which an event of *kind* is found."""
+    """Return the group of events of *kind*, a filter of the Events view.
+
+    The groups are fault, audit, trouble, scaling and other.
+    """
     if kind.startswith(_FAULT):
         return "fault"
     if kind.startswith("audit"):
@@ -58,7 +64,7 @@ def group_of(kind: str) -> str:
 
 
 def level_of(kind: str) -> str:
-    """Return the level at which a log shows an event of *kind*."""
+    """Return the log level of events of *kind*: "warning" in the groups fault and trouble, else "info"."""
     return "warning" if group_of(kind) in ("fault", "trouble") else "info"
 
 

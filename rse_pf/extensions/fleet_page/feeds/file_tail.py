@@ -1,6 +1,6 @@
-"""New lines of files that other processes write, whatever happens to these: renamed, set aside, begun anew.
+"""Read the lines that other processes append to files, also if a file is renamed, replaced or truncated.
 
-A file is known by its inode, so that it is read to its end after it was renamed.  Nothing is interpreted.
+A file is identified by its inode, so that a renamed file is read to its end.  Lines are not parsed.
 """
 
 from __future__ import annotations
@@ -10,30 +10,34 @@ from pathlib import Path
 
 __all__ = ["FileTail"]
 
+# Largest number of bytes that one call reads of a file; of more, the last ones are read.
 _MAX_READ_BYTES = 1 << 20
+# Number of bytes at the end of a file that the first call reads, and largest part of a line that is stored.
 _TAIL_BYTES = 1 << 18
+# Largest number of files whose positions are stored.
 _MAX_FILES = 1024
 
 
 class FileTail:
-    """Reads what is appended to files, and first the end of what is there."""
+    """Reads files: at first their last lines, then what is appended."""
 
     def __init__(self) -> None:
-        """Read nothing yet."""
+        """Start without files."""
         self._read: dict[tuple[int, int], int] = {}
         self._rest: dict[tuple[int, int], bytes] = {}
 
     def new_lines(self, file: Path) -> list[bytes]:
-        """Return the whole lines of *file* since the last call, without line breaks; none if it is gone.
+        """Return the complete lines of *file* since the last call, without line breaks.
 
-        At most 1 MiB is read at once: what was written before it is skipped.
+        At the first call these are the lines in its last 256 KiB.  If more than 1 MiB was written since, only
+        the last MiB is read.  The result is empty if the file cannot be read.
         """
         try:
             status = file.stat()
             key, size = (status.st_dev, status.st_ino), status.st_size
             position = self._read.get(key)
             start = max(0, size - _TAIL_BYTES) if position is None else position
-            if size < start:  # it was begun anew
+            if size < start:  # the file was truncated
                 start, self._rest[key] = 0, b""
             is_cut = position is None and start > 0
             if size - start > _MAX_READ_BYTES:
@@ -51,7 +55,10 @@ class FileTail:
 
 
 def _part(file: Path, key: tuple[int, int], start: int, count: int) -> bytes:
-    """Return *count* bytes of *file*; raises OSError if another file has its name by now."""
+    """Return *count* bytes of *file* from *start*.
+
+    Raises OSError if its name now belongs to another inode.
+    """
     with file.open("rb") as opened:
         status = os.fstat(opened.fileno())
         if (status.st_dev, status.st_ino) != key:

@@ -1,6 +1,6 @@
-"""Live maps for the page: it subscribes to ``live/MAP`` as a robot does, while somebody looks.
+"""The feed of live maps: it subscribes to ``live/MAP`` as a robot does, while a page shows live maps.
 
-The token is issued here, from the platform's key, for reading live maps and nothing else.
+The feed issues its own token with the platform's key; the token allows to read live maps and nothing else.
 """
 
 from __future__ import annotations
@@ -26,40 +26,47 @@ from rse_pf.terminal import printable
 __all__ = ["LIVE", "SCOPES", "LiveFeed", "RobotPaths", "histories", "plain"]
 
 LIVE = "live/"
+# Name of the robot in the feed's token.
 _ROBOT = "fleet-page"
 SCOPES = ("maps:live", SYNTHETIC)
-"""What the page's own token allows: its connection is not counted as a robot."""
+"""Scopes of the feed's token; the second one lets servers not count the connection as a robot."""
+# Validity of the feed's token, in seconds.
 _TTL_S = 600.0
-_LOOK_S = 0.5
+# Time between two checks which maps the open pages show, in seconds.
+_CHECK_PAGES_S = 0.5
+# Time between two readings of the list of live maps, in seconds.
 _LIST_EVERY_S = 3.0
+# Largest number of live maps of a tenant that are listed.
 _MAX_MAPS = 8
+# Largest number of positions in the path of a robot; above it, the oldest are dropped.
 _MAX_PATH = 2000
+# Time between two readings of the paths of a live map, in seconds.
 _HISTORY_EVERY_S = 3.0
 
 
 class LiveFeed:
-    """Feeds a `Hub` with the live maps that pages ask for."""
+    """Puts the live maps that open pages show into a `Hub`."""
 
     def __init__(self, hub: Hub, folder: Path) -> None:
-        """Ask for nothing yet; *folder* is that of the platform's state."""
+        """Describe the platform whose state is in *folder*; nothing is connected."""
         self._hub = hub
         self._folder = folder
         self._followed: dict[str, asyncio.Task[None]] = {}
 
     async def run(self) -> None:
-        """Connect while a page looks at live maps, until cancelled."""
+        """Connect to the platform while a page is open, and follow the maps it shows, until cancelled."""
         while True:
             if self._hub.watches("maps"):
                 with contextlib.suppress(RsePfError, OSError):
                     await self._connect()
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_CHECK_PAGES_S)
 
     async def _connect(self) -> None:
         from client_sdk import connect
 
         state = await asyncio.to_thread(read_state, self._folder)
         if state is None or not state.url or state.lan:
-            return  # by TLS with a private authority: see docs/fleet_page.md
+            return  # its certificate has a private authority that the feed does not know: docs/fleet_page.md
         settings = platform_settings(self._folder) or PlatformSettings()
         tenants = await asyncio.to_thread(self._tenants)
 
@@ -91,15 +98,15 @@ class LiveFeed:
         """List the live maps through the connection of each tenant, and follow those that a page shows."""
         labels: dict[str, Any] = {}
         for tenant, robot in robots.items():
-            with contextlib.suppress(RsePfError):  # one tenant hides no other one
+            with contextlib.suppress(RsePfError):  # an error for one tenant does not affect the others
                 listed = (await robot.call("live-list", {})).reply.get("maps", [])
                 labels.update({map_label(tenant, str(entry["name"])): robot for entry in listed[:_MAX_MAPS]})
         self._hub.put("maps", "live", list(labels))
-        for _ in range(round(_LIST_EVERY_S / _LOOK_S)):
+        for _ in range(round(_LIST_EVERY_S / _CHECK_PAGES_S)):
             for label, robot in labels.items():
                 if label not in self._followed and self._hub.watches(LIVE + label):
                     self._followed[label] = asyncio.ensure_future(self._follow(robot, label))
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_CHECK_PAGES_S)
 
     async def _follow(self, robot: Any, label: str) -> None:
         reading = asyncio.ensure_future(self._follow_history(robot, label))
@@ -109,7 +116,7 @@ class LiveFeed:
             reading.cancel()
 
     async def _follow_history(self, robot: Any, label: str) -> None:
-        """Tell where all robots have been, also before anybody looked, from the keyframes of the map."""
+        """Publish the paths of all robots from the map's keyframes, also from before a page was open."""
         version = -1
         while True:
             if self._hub.watches(LIVE + label):
@@ -133,19 +140,23 @@ class LiveFeed:
 
 
 class RobotPaths:
-    """Where each robot of a live map has been, in its odometry frame, which corrections move as a whole.
+    """The path of each robot of a live map in its odometry frame, which corrections of the map move.
 
-    They are metres: where a robot has none, what its unit is found to be stretches its path.
+    Positions are in metres.  The path of a robot without metric scale is rescaled when the map finds another
+    scale.
     """
 
     def __init__(self) -> None:
-        """Know no robot yet."""
+        """Start without robots."""
         self._T_map_odom: dict[str, tuple[Any, Any]] = {}
         self._scales: dict[str, tuple[Any, float]] = {}
         self._paths: dict[str, dict[str, Any]] = {}
 
     def take(self, value: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Take an alignment or a pose, and return the robot's path if it has grown."""
+        """Process *value*, an alignment or pose of a robot; return the robot's path if a position was added.
+
+        None for all other values, and for a pose before the alignment of its segment.
+        """
         robot, segment = str(value.get("robot", "")), value.get("segment")
         T_map_odom, T_map_camera = value.get("T_map_odom"), value.get("T_map_camera")
         if value.get("kind") == "alignment" and value.get("aligned") and _is_matrix(T_map_odom):
@@ -167,7 +178,10 @@ class RobotPaths:
         return path
 
     def _stretch(self, robot: str, segment: Any, scale: Any) -> None:
-        """Take how many metres the unit of a robot's segment is, if it has one."""
+        """Store *scale*, the metres per unit of a robot's segment, and rescale the path by its change.
+
+        A value that is no positive number is ignored.
+        """
         if not isinstance(scale, float) or not 0.0 < scale < math.inf:
             return
         before, path = self._scales.get(robot), self._paths.get(robot)
@@ -178,17 +192,20 @@ class RobotPaths:
 
 
 def histories(paths: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return ``parts`` by robot, every text escaped: positions (metres, in the map), segment by segment."""
+    """Return for each robot of *paths* its positions (m, in the map) as ``parts``, a list for each segment.
+
+    All texts are escaped.
+    """
     found: dict[str, dict[str, Any]] = {}
     for path in paths:
         robot = printable(str(path.get("robot", "")))
-        told = found.setdefault(robot, {"kind": "history", "robot": robot, "parts": []})
-        told["parts"].append(plain(path.get("points", [])))
+        history = found.setdefault(robot, {"kind": "history", "robot": robot, "parts": []})
+        history["parts"].append(plain(path.get("points", [])))
     return found
 
 
 def plain(value: Any) -> Any:
-    """Return *value* with arrays as lists and every text escaped."""
+    """Return *value* for JSON: arrays as lists, and all texts escaped, also inside mappings and lists."""
     if isinstance(value, Mapping):
         return {printable(str(name)): plain(item) for name, item in value.items()}
     if isinstance(value, str):
@@ -203,7 +220,7 @@ def _is_matrix(value: Any) -> bool:
 
 
 def _position_in_odometry(T_map_odom: Sequence[float], T_map_camera: Sequence[float]) -> list[float]:
-    """Return the position of the camera in the odometry frame, ``(3,)`` metres."""
+    """Return the position ``(3,)`` (m) of the camera in the odometry frame; both poses are 16 numbers."""
     moved = [T_map_camera[4 * row + 3] - T_map_odom[4 * row + 3] for row in range(3)]
     return [
         round(sum(T_map_odom[4 * row + column] * moved[row] for row in range(3)), 4) for column in range(3)

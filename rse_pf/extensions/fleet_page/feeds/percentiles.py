@@ -1,7 +1,8 @@
-"""Percentiles of the last minute from the servers' histograms of durations, which count since their start.
+"""Percentiles of answer times over the last minute, from the servers' histograms of durations.
 
-A percentile is as exact as the buckets are: it is interpolated within its bucket.  The histogram of a server
-that restarted, or that was not there a minute ago, counts from zero.
+A server's histogram counts since the server started: the answers of the last minute are the difference of two
+readings.  A percentile is interpolated within its bucket.  For a server that restarted or is new, the
+difference is taken from its first reading.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ _BUCKET = re.compile(r"rse_pf_duration_seconds_bucket\{([^}]*)\} ([0-9.eE+]+)")
 _BOUND = re.compile(r'le="([^"]+)"')
 
 Buckets = dict[float, float]
-"""Upper bound in seconds to how many answers took at most that long."""
+"""A cumulative histogram: the number of answers that took at most the key, in seconds."""
 
 
 def buckets_of(page: str) -> Buckets:
-    """Return the histogram of all services on a server's page of metrics."""
+    """Return the histogram of durations in *page*, a server's Prometheus metrics, summed over services."""
     buckets: Buckets = {}
     for labels, value in _BUCKET.findall(page):
         bound = _BOUND.search(labels)
@@ -34,9 +35,10 @@ def buckets_of(page: str) -> Buckets:
 
 
 def percentile(buckets: Mapping[float, float], share: float) -> float | None:
-    """Return the time that *share* of the answers took at most, in seconds; None if there are none.
+    """Return the time in seconds within which the fraction *share* of the answers arrived.
 
-    An answer beyond the last bound counts as that bound.
+    None without answers.
+    Answers beyond the last finite bound count as that bound.
     """
     bounds = sorted(buckets)
     total = buckets[bounds[-1]] if bounds else 0.0
@@ -58,18 +60,24 @@ class LastMinute:
     """The histograms of all servers over the last minute."""
 
     def __init__(self) -> None:
-        """Know nothing yet."""
+        """Start without histograms."""
         self._taken: dict[str, deque[tuple[float, Buckets]]] = {}
 
     def add(self, server: str, buckets: Buckets, *, now_s: float) -> None:
-        """Take the present histogram of *server*."""
+        """Add the histogram of *server* that was read at *now_s* (s).
+
+        After a restart, older ones are dropped.
+        """
         snapshots = self._taken.setdefault(server, deque())
         if snapshots and any(buckets.get(bound, 0.0) < count for bound, count in snapshots[-1][1].items()):
-            snapshots.clear()  # it restarted
+            snapshots.clear()  # a count decreased: the server was restarted
         snapshots.append((now_s, buckets))
 
     def document(self, *, now_s: float, servers: Sequence[str]) -> dict[str, Any]:
-        """Return p50, p95 and p99 in milliseconds, the count, and how many seconds they cover."""
+        """Return p50, p95 and p99 (ms) of the answers of *servers* in the last minute, and their count.
+
+        ``covered_s`` is the time between the readings, at most 60 s.  Percentiles are None without answers.
+        """
         for gone in set(self._taken) - set(servers):
             del self._taken[gone]
         summed: Buckets = {}
@@ -83,11 +91,11 @@ class LastMinute:
                 summed[bound] = summed.get(bound, 0.0) + count - first.get(bound, 0.0)
         count = max(summed.values(), default=0.0)
 
-        def told(share: float) -> float | None:
+        def percentile_ms(share: float) -> float | None:
             value = percentile(summed, share)
             return None if value is None else round(1e3 * value, 2)
 
         return {
-            "p50_ms": told(0.5), "p95_ms": told(0.95), "p99_ms": told(0.99), "count": int(count),
-            "covered_s": round(min(covered_s, _MINUTE_S), 1),
+            "p50_ms": percentile_ms(0.5), "p95_ms": percentile_ms(0.95), "p99_ms": percentile_ms(0.99),
+            "count": int(count), "covered_s": round(min(covered_s, _MINUTE_S), 1),
         }  # fmt: skip

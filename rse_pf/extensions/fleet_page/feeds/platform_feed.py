@@ -1,8 +1,7 @@
-"""What the page knows of one local platform: read from its operator's port, its servers and its logs.
+"""The feed of one local platform: it reads the control plane's operator port, the servers and the logs.
 
-The control plane is asked for one stream and nothing else; servers are asked for their histograms, and for
-their robots only while somebody looks.
-Whatever does not answer is shown as silent, and asked again.
+The control plane is sent a single request, for its stream of states and events.  Servers are requested for
+their histograms, and for their robots only while a page is open.  After an error, a request is repeated.
 """
 
 from __future__ import annotations
@@ -38,27 +37,39 @@ from rse_pf.terminal import printable
 
 __all__ = ["LocalFeed", "fleet_document", "moved_robots"]
 
+# Time between two readings of the servers' robots, in seconds.
 _ROBOTS_EVERY_S = 1.0
+# Time between two readings of the servers' histograms, in seconds.
 _METRICS_EVERY_S = 5.0
+# Time between the first two readings of the histograms, in seconds: percentiles are computed from two
+# readings.
 _FIRST_METRICS_S = 1.0
-"""Between the first two readings, of which a percentile is the difference."""
+# Time between two readings of the servers' logs, in seconds.
 _LOGS_EVERY_S = 0.3
+# Time between two readings of the audit logs, in seconds.
 _AUDIT_EVERY_S = 0.5
-_AGAIN_S = 0.5
-_ASK_S = 2.0
+# Pause before the stream of the control plane is requested again, in seconds.
+_RETRY_S = 0.5
+# Time limit of a request to a server, in seconds.
+_REQUEST_TIMEOUT_S = 2.0
+# Number of samples in the charts: the last ten minutes.
 _HISTORY = 600
+# Largest number of characters of a text.
 _MAX_TEXT = 300
-_MAX_TOLD_MOVES = 50
+# Largest number of events about moved robots after one reading.
+_MAX_MOVE_EVENTS = 50
+# Largest number of robots that are on no server whose last server is stored.
 _MAX_GONE = 500
+# Exceptions of an unexpected answer, such as that of a server of another version or of one that is being
+# killed.
 _UNREADABLE = (RsePfError, OSError, ValueError, KeyError, TypeError)
-"""A server of another version, or one that is just killed, may answer anything: it is asked again."""
 
 
 class LocalFeed:
-    """Feeds a `Hub` with what one platform does."""
+    """Puts state, robots, commands and events of one local platform into a `Hub`."""
 
     def __init__(self, hub: Hub, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        """Read nothing yet; *folder* is that of the platform's state, *clock* is monotonic, in seconds."""
+        """Describe the platform whose state is in *folder*; *clock* returns seconds, monotonic."""
         self._hub = hub
         self._folder = folder
         self._clock = clock
@@ -74,17 +85,17 @@ class LocalFeed:
         self._sampled_s: float | None = -1.0
 
     async def run(self) -> None:
-        """Feed until cancelled."""
+        """Read and publish until cancelled."""
         await run_together(
             self._watch(), self._follow_robots(), self._follow_metrics(), self._follow_logs(),
             self._follow_audit(),
         )  # fmt: skip
 
-    # --- the control plane -----------------------------------------------------------------------
+    # --- the stream of the control plane -------------------------------------------------------
 
     async def _watch(self) -> None:
         while True:
-            # It restarts, or has ended: asked again.
+            # The control plane may be restarting or stopped: the stream is requested again after a pause.
             with contextlib.suppress(OSError, ValueError, EOFError, RsePfError, asyncio.TimeoutError):
                 await self._watch_once()
             if self._connected:
@@ -92,7 +103,7 @@ class LocalFeed:
                 self._watched_s = (self._watched_s[0], time.time())
                 self._event({"event": "control-plane-silent", "time_s": time.time()})
             self._hub.put("link", "control_plane", {"connected": False, "time_s": time.time()})
-            await asyncio.sleep(_AGAIN_S)
+            await asyncio.sleep(_RETRY_S)
 
     async def _watch_once(self) -> None:
         state = await asyncio.to_thread(read_state, self._folder)
@@ -101,8 +112,10 @@ class LocalFeed:
         self._settings = platform_settings(self._folder) or PlatformSettings()
         token = read_control_token(Path(state.control_token_file))
         port = ControlPort(state.status_port, token)
-        async with contextlib.aclosing(port.follow("/watch", silence_s=_ASK_S + 3.0, method="GET")) as told:
-            async for message in told:
+        async with contextlib.aclosing(
+            port.follow("/watch", silence_s=_REQUEST_TIMEOUT_S + 3.0, method="GET")
+        ) as messages:
+            async for message in messages:
                 if not self._connected:
                     self._connected = True
                     self._watched_s = (time.time(), math.inf)
@@ -118,13 +131,15 @@ class LocalFeed:
         document = fleet_document(state, self._settings, time_s=now)
         for server in document["servers"]:
             server["age_s"] = _age_s(server["pid"])
-        if sample:  # both processes read the clock of this machine
+        if (
+            sample
+        ):  # the control plane's monotonic clock is that of this process, since both are on one machine
             document["sample_age_s"] = round(time.monotonic() - float(sample["time"]), 3)
         document["percentiles"] = self._percentiles
         document["pages"] = self._hub.pages
         self._hub.put("fleet", "now", document)
         if sample.get("time") == self._sampled_s:
-            return  # an event was the reason to tell the state again
+            return  # the state was sent because of an event, with the same sample as before
         self._sampled_s = sample.get("time")
         row = [round(now, 2), document["cpu_percent"], sample.get("requests"), sample.get("robots")]
         self._history.append([*row, self._percentiles.get("p99_ms")])
@@ -141,7 +156,7 @@ class LocalFeed:
         }
         self._hub.append("event", row)
 
-    # --- servers and logs ------------------------------------------------------------------------
+    # --- requests to servers, and their logs ---------------------------------------------------
 
     async def _follow_robots(self) -> None:
         while True:
@@ -160,15 +175,19 @@ class LocalFeed:
                 who = [printable(str(row["tenant"])), printable(str(row["robot"]))]
                 rows.append([robot, name, row["codec"], row["connected_s"], row["commands"], last, *who])
         where = {str(row[0]): str(row[1]) for row in rows}
-        for robot, before, after in moved_robots(self._where, where)[:_MAX_TOLD_MOVES]:
+        for robot, before, after in moved_robots(self._where, where)[:_MAX_MOVE_EVENTS]:
             self._event({"event": "robot-moved", "robot": robot, "before": before, "server": after})
-        # A robot that moves is on no server for a moment: those that are gone are forgotten later.
+        # A robot that moves is on no server for a moment, so that the last servers of absent robots are
+        # stored.
         gone = [item for item in self._where.items() if item[0] not in where][-_MAX_GONE:]
         self._where = {**dict(gone), **where}
         self._hub.put("robots", "now", rows)
 
     async def _follow_metrics(self) -> None:
-        """Read the histograms of all servers, also while nobody looks: a page begins with the last minute."""
+        """Read the histograms of all servers, also while no page is open.
+
+        So a new page has percentiles at once.
+        """
         while True:
             with contextlib.suppress(*_UNREADABLE):
                 await self._read_metrics()
@@ -191,7 +210,7 @@ class LocalFeed:
         token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None
         replies = await asyncio.gather(
             *(
-                ControlPort(server.control_port, token).ask_once(target, timeout_s=_ASK_S)
+                ControlPort(server.control_port, token).ask_once(target, timeout_s=_REQUEST_TIMEOUT_S)
                 for server in servers
             )
         )
@@ -214,12 +233,18 @@ class LocalFeed:
             await asyncio.sleep(_AUDIT_EVERY_S)
 
     def _was_watched(self, entry: Entry) -> bool:
-        """Return whether the control plane told of *entry* itself; what it did before is in the log only."""
+        """Return whether the control plane sent the event of *entry* in its stream as well.
+
+        Events from before the connection to its stream, or after the loss of it, are in the log only.
+        """
         return self._watched_s[0] <= entry.time <= self._watched_s[1]
 
 
 def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time_s: float) -> dict[str, Any]:
-    """Return what the Fleet view shows of the control plane's *state*, every text escaped."""
+    """Return the document that the Fleet view shows for *state* of the control plane; texts are escaped.
+
+    *time_s* is the present time in Unix seconds.
+    """
     sample = state.get("sample") or {}
     policy = state.get("policy") or {}
     servers = [_server(server) for server in state.get("servers", [])]
@@ -248,7 +273,10 @@ def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time
 
 
 def moved_robots(before: Mapping[str, str], after: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Return robot, old server and new server of each robot that is elsewhere now."""
+    """Return robot, old server and new server of each robot whose server changed.
+
+    *before* and *after* map robots to servers; robots that are not in both are left out.
+    """
     return [
         (robot, before[robot], server)
         for robot, server in after.items()
@@ -261,7 +289,10 @@ def _robot(tenant: str, name: str) -> str:
 
 
 def _mean_cpu(servers: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the mean over all servers that told their CPU, those that warm up included."""
+    """Return the mean CPU (%) of all servers that reported theirs, also those that warm up.
+
+    None without any.
+    """
     percents = [float(server["cpu_percent"]) for server in servers if server["cpu_percent"] is not None]
     return round(sum(percents) / len(percents), 1) if percents else None
 
@@ -283,7 +314,7 @@ def _data_server(server: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _age_s(pid: Any) -> float | None:
-    """Return for how long a process has run; None if there is none."""
+    """Return the time since the start of the process *pid*, in seconds; None if there is no such process."""
     mark = mark_of(pid) if isinstance(pid, int) else None
     if mark is None:
         return None

@@ -1,6 +1,6 @@
-"""What the scale modifier waits for, in words; pure.
+"""Sentences that announce what the scale modifier will do next, and when.
 
-The sentences follow `rse_pf.scaling.policy.decide`, whose result they announce: a test compares the two.
+They follow the rules of `rse_pf.scaling.policy.decide`; a test compares the sentences with its decisions.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight"
 
 
 def waiting_for(policy: Mapping[str, Any], settings: ScalingSettings, *, servers: int) -> list[str]:
-    """Return what the scale modifier waits for, the most important first.
+    """Return sentences about the conditions for which the scale modifier waits, the most important first.
 
     Args:
-        policy: Its part of the platform's status: ``elastic``, ``samples`` of whole periods, bounds.
-        settings: Group scaling of the platform.
-        servers: Those that start or serve.
+        policy: The scale modifier's part of the platform's status: ``elastic``, ``samples`` of complete
+            periods, and
+            the smallest and largest number of servers.
+        settings: The group scaling of the platform's settings.
+        servers: Number of servers that are starting or serving.
     """
     if not policy.get("elastic"):
         return ["the scale modifier is off: no server is added, removed or replaced by itself"]
