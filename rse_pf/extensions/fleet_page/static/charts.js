@@ -1,9 +1,11 @@
-// Line charts of the last ten minutes, in the colours of the present theme.
+// Line charts of a value over time, drawn by uPlot in the colours of the page's theme.
 
 import uPlot from "./vendor/uPlot.esm.js";
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
+// Return a chart inside the element *parent*: set(times, values) draws it, with times in Unix seconds and null for an
+// unknown value; themed() draws it again after a change of the theme.  *top* is the least upper end of the y axis.
 export function chart(parent, { title, unit, digits, top }) {
   let plot = null;
   let data = [[], []];

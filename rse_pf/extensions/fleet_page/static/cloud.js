@@ -1,27 +1,28 @@
-// A cloud as it arrives: a head, then blocks of points, each a sample of the whole.
+// The point cloud of a map, which is received in parts: a header, then blocks of points.  The points received so far
+// are always an even sample of the whole cloud (see packer in clouds.py).
 
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial } from "./vendor/three.module.js";
 
-const BYTES = 9; // three 16-bit numbers and three bytes of colour
+const BYTES = 9; // bytes of a point: three 16-bit coordinates and three bytes of colour
 
+// A cloud on the graphics card; *header* is that of the packed map, and ready counts the points received so far.
 export class Cloud {
-  constructor(told) {
-    this.told = told;
+  constructor(header) {
     this.ready = 0;
-    this.numbers = new Uint16Array(3 * told.points);
-    this.colours = new Uint8Array(3 * told.points);
+    this.numbers = new Uint16Array(3 * header.points);
+    this.colours = new Uint8Array(3 * header.points);
     this.geometry = new BufferGeometry();
-    // Positions stay the 16-bit numbers that came: the object's matrix makes metres of them.
+    // Positions stay 16-bit integers, as received: the matrix of the three.js object converts them to metres.
     this.geometry.setAttribute("position", new BufferAttribute(this.numbers, 3));
     this.geometry.setAttribute("color", new BufferAttribute(this.colours, 3, true));
     this.geometry.setDrawRange(0, 0);
     this.points = new Points(this.geometry, new PointsMaterial({ size: 1.6, sizeAttenuation: false, vertexColors: true }));
     this.points.matrixAutoUpdate = false;
-    this.points.matrix.makeScale(...told.step).setPosition(...told.low);
+    this.points.matrix.makeScale(...header.step).setPosition(...header.low);
     this.points.frustumCulled = false;
   }
 
-  // Take the bytes of the next block.
+  // Add the next block: *bytes* holds the positions of *count* points, then their colours.
   take(bytes, count) {
     const [from, all] = [3 * this.ready, 3 * count];
     this.numbers.set(new Uint16Array(bytes.buffer, bytes.byteOffset, all), from);
@@ -33,7 +34,7 @@ export class Cloud {
     this.ready += count;
   }
 
-  // Draw the points from number *from* on, at most *most*; return how many these are.
+  // Let the next frame draw the received points from number *from* on, at most *most*; return their number.
   show(from, most) {
     const count = Math.min(Math.floor(most), this.ready - from);
     this.geometry.setDrawRange(from, count);
@@ -46,15 +47,15 @@ export class Cloud {
   }
 }
 
-// Calls begin(told) once, then more(bytes, count) for each block of the body of *answer*; returns told, null
-// if the cloud is no longer wanted.
+// Read a packed map from the body of *answer*: call begin(header) once, then more(bytes, count) for each block.
+// Return the header; return null and stop to read once isWanted() is false.
 export async function readCloud(answer, isWanted, begin, more) {
   const source = new Source(answer.body.getReader());
   const length = new DataView((await source.read(4)).buffer).getUint32(0, true);
-  const told = JSON.parse(new TextDecoder().decode(await source.read(length)));
-  if (isWanted()) begin(told);
-  for (let have = 0; have < told.points;) {
-    const count = Math.min(told.block, told.points - have);
+  const header = JSON.parse(new TextDecoder().decode(await source.read(length)));
+  if (isWanted()) begin(header);
+  for (let have = 0; have < header.points;) {
+    const count = Math.min(header.block, header.points - have);
     const bytes = await source.read(BYTES * count);
     if (!isWanted()) {
       await source.reader.cancel();
@@ -63,16 +64,17 @@ export async function readCloud(answer, isWanted, begin, more) {
     more(bytes, count);
     have += count;
   }
-  return isWanted() ? told : null;
+  return isWanted() ? header : null;
 }
 
+// Reads exact numbers of bytes from a stream, whose chunks have any size.
 class Source {
   constructor(reader) {
     this.reader = reader;
     this.rest = new Uint8Array(0);
   }
 
-  // Return the next *size* bytes, at the start of a buffer of their own.
+  // Return the next *size* bytes in a new buffer of that size; throw an error if the stream ends before.
   async read(size) {
     const bytes = new Uint8Array(size);
     for (let have = 0; have < size;) {

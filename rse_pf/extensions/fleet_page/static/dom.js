@@ -1,5 +1,6 @@
-// Small helpers: elements whose texts are always text, numbers and times for people.
+// Helpers for the document: elements whose strings are never parsed as HTML, and numbers and times as text.
 
+// Return a new element.  An attribute "onEVENT" is a listener; null, undefined and false leave an attribute out.
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -13,14 +14,17 @@ export function element(tag, attributes = {}, ...children) {
 
 export const byId = (id) => document.getElementById(id);
 
+// Set the text of *node* only if it differs, so that screen readers are not notified without a change.
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
+// Return *value* with *digits* decimals as text; a dash for an unknown value.
 export function number(value, digits = 0) {
   return value === null || value === undefined ? "–" : Number(value).toFixed(digits);
 }
 
+// Return a duration as text in its largest fitting unit; a dash for an unknown one.
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   for (const [size, unit] of [[86400, "d"], [3600, "h"], [60, "min"]]) {
@@ -29,18 +33,22 @@ export function duration(seconds) {
   return `${Math.round(seconds)} s`;
 }
 
+// Return the local time of day of *timeS*, Unix seconds.
 export function clock(timeS) {
   return new Date(timeS * 1000).toLocaleTimeString("en-GB");
 }
 
+// Symbols of states, so that states do not differ by colour only.
 const MARKS = {
   healthy: "●", runs: "●", starting: "◔", draining: "▽", unhealthy: "▲", gone: "✕", weak: "▲", failed: "✕",
 };
 
+// Return an element with the state *text* and its symbol.
 export function state(text) {
   return element("span", { class: "state", "data-state": text }, `${MARKS[text] ?? "○"} ${text}`);
 }
 
+// Show *text* at the corner of the page for 6 s.
 export function toast(text) {
   const box = byId("toast");
   box.textContent = text;
@@ -49,8 +57,9 @@ export function toast(text) {
   toast.timer = setTimeout(() => box.toggleAttribute("data-on", false), 6000);
 }
 
+// Show a dialog with the button *button*, and with an input field if *input* holds its attributes.  The promise
+// resolves to the text of the field (true without a field) when the button is pressed, and to null on cancel.
 export function confirmed({ title, text, button, input }) {
-  // Resolves to the text of the input (or true) when the button is pressed, to null otherwise.
   const dialog = byId("dialog");
   return new Promise((resolve) => {
     const field = input ? element("input", { ...input, id: "dialog-input" }) : null;

@@ -1,12 +1,14 @@
-// The Events view: a timeline, filters, and the list; what is shown can be saved as a file.
+// The Events view: a timeline, filters, and a list of events; the events that match the filters can be saved as a file.
 
 import { clock, element } from "./dom.js";
 
+// Groups of events, in the order of the filters, with their titles.
 const GROUPS = { trouble: "Trouble", fault: "Faults", scaling: "Scaling and moves", audit: "Audit", other: "Other" };
-const KEPT = 2000;
-const SHOWN = 400;
-const TIMELINE_S = 600;
+const KEPT = 2000; // largest number of events in memory
+const SHOWN = 400; // largest number of events in the list
+const TIMELINE_S = 600; // time that the timeline covers, in seconds
 
+// Create the view in the element *root*; *count* is the element with the number of unseen events.
 export function eventsView(root, count) {
   let events = [];
   let unseen = 0;
@@ -78,7 +80,7 @@ export function eventsView(root, count) {
 
   return {
     take(event) {
-      let at = events.length;  // rows of the audit log come a little later than events
+      let at = events.length;  // rows of the audit log arrive a little later than events of the same time
       while (at > 0 && events[at - 1].time_s > event.time_s) at -= 1;
       events.splice(at, 0, event);
       if (events.length > KEPT) events = events.slice(-KEPT);

@@ -1,12 +1,13 @@
-// The Fleet view: the six boxes of the paper's Fig. 2, the servers, and where the robots are.
+// The Fleet view: the six boxes of the paper's Fig. 2, the servers, the robots on each server, and charts.
 
 import { chart } from "./charts.js";
 import { clock, confirmed, duration, element, number, setText, state, toast } from "./dom.js";
 import { isOperator, post } from "./session.js";
 
-const MAX_DOTS = 500;
-const MAX_LISTED = 200;
+const MAX_DOTS = 500; // largest number of robots that are drawn as dots
+const MAX_LISTED = 200; // largest number of robots in the table
 
+// Create the view in the element *root*; its methods take the values of the topics of the stream.
 export function fleetView(root) {
   const box = (title) => {
     const big = element("div", { class: "big" }, "–");
@@ -58,7 +59,7 @@ export function fleetView(root) {
   const racksPanel = element("div", { class: "panel" }, element("h2", {}, "Robots on their servers"), racks, racksNote);
   const unknown = element("ul", { class: "soft" });
   const cloudPanels = element("div", { class: "grid wide", hidden: true },
-    element("div", { class: "panel" }, element("h2", {}, "What AWS does not tell"), unknown));
+    element("div", { class: "panel" }, element("h2", {}, "Data that AWS does not provide"), unknown));
   root.append(
     element("div", { class: "grid" }, ...Object.values(boxes).map((each) => each.panel)),
     waitingPanel,
@@ -74,41 +75,41 @@ export function fleetView(root) {
   let history = null;
   let latest = [];
 
-  function take(told) {
-    const rate = told.requests;
-    setText(boxes.robots.big, number(told.robots));
-    setText(boxes.robots.small, told.cloud ? `${number(rate, 1)} commands a second in the last minute` : `${number(rate)} commands in the last second`);
-    setText(boxes.firewall.big, told.tls ? "TLS, tokens" : told.cloud ? told.protocols.join(", ") || "not known" : "this machine only");
-    setText(boxes.firewall.small, told.url || "nobody can connect yet");
-    setText(boxes.balancer.big, told.balancer ? "runs" : told.cloud ? told.balancer_state : "is down");
-    setText(boxes.balancer.small, `${megabytes(told.bytes_in)} in, ${megabytes(told.bytes_out)} out a second`);
-    const healthy = told.servers.filter((server) => server.state === "healthy").length;
-    setText(boxes.servers.big, `${healthy} of ${told.servers.length}`);
-    setText(boxes.servers.small, told.cloud ? `healthy; the group wants ${told.wanted_servers}` : `healthy; data servers: ${told.data_servers.map((each) => `${each.name} ${each.state}`).join(", ") || "none"}`);
-    setText(boxes.monitor.big, told.cpu_percent === null ? "–" : `${number(told.cpu_percent)} % CPU`);
-    const p = told.percentiles ?? {};
+  function take(fleet) {
+    const rate = fleet.requests;
+    setText(boxes.robots.big, number(fleet.robots));
+    setText(boxes.robots.small, fleet.cloud ? `${number(rate, 1)} commands a second in the last minute` : `${number(rate)} commands in the last second`);
+    setText(boxes.firewall.big, fleet.tls ? "TLS, tokens" : fleet.cloud ? fleet.protocols.join(", ") || "not known" : "this machine only");
+    setText(boxes.firewall.small, fleet.url || "nobody can connect yet");
+    setText(boxes.balancer.big, fleet.balancer ? "runs" : fleet.cloud ? fleet.balancer_state : "is down");
+    setText(boxes.balancer.small, `${megabytes(fleet.bytes_in)} in, ${megabytes(fleet.bytes_out)} out a second`);
+    const healthy = fleet.servers.filter((server) => server.state === "healthy").length;
+    setText(boxes.servers.big, `${healthy} of ${fleet.servers.length}`);
+    setText(boxes.servers.small, fleet.cloud ? `healthy; the group wants ${fleet.wanted_servers}` : `healthy; data servers: ${fleet.data_servers.map((each) => `${each.name} ${each.state}`).join(", ") || "none"}`);
+    setText(boxes.monitor.big, fleet.cpu_percent === null ? "–" : `${number(fleet.cpu_percent)} % CPU`);
+    const p = fleet.percentiles ?? {};
     setText(boxes.monitor.small, p.count
       ? `last ${Math.round(p.covered_s)} s: p50 ${p.p50_ms}, p95 ${p.p95_ms}, p99 ${p.p99_ms} ms of ${p.count} commands`
-      : told.cloud ? "no answer times were published"
+      : fleet.cloud ? "no answer times were published"
         : p.covered_s ? `no command in the last ${p.covered_s < 59 ? `${Math.round(p.covered_s)} s` : "minute"}` : "answer times are being read");
-    setText(boxes.modifier.big, `${told.min_servers ?? "–"} to ${told.max_servers ?? "–"}`);
-    setText(boxes.modifier.small, `servers; busy above ${number(told.busy_percent)} % CPU, measured every ${number(told.period_s)} s${told.last_action ? `; last: ${told.last_action}` : ""}`);
-    const said = told.waiting.map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
-    if (waiting.dataset.text !== said.join("\n")) {
-      waiting.dataset.text = said.join("\n");
-      waiting.replaceChildren(...said.map((text) => element("p", {}, text)));
+    setText(boxes.modifier.big, `${fleet.min_servers ?? "–"} to ${fleet.max_servers ?? "–"}`);
+    setText(boxes.modifier.small, `servers; busy above ${number(fleet.busy_percent)} % CPU, measured every ${number(fleet.period_s)} s${fleet.last_action ? `; last: ${fleet.last_action}` : ""}`);
+    const sentences = fleet.waiting.map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
+    if (waiting.dataset.text !== sentences.join("\n")) {
+      waiting.dataset.text = sentences.join("\n");
+      waiting.replaceChildren(...sentences.map((text) => element("p", {}, text)));
     }
-    takeServers(told.servers);
-    cloudPanels.hidden = !told.cloud;
-    racksPanel.hidden = robotsPanel.hidden = Boolean(told.cloud);
-    if (told.cloud) takeCloud(told);
+    takeServers(fleet.servers);
+    cloudPanels.hidden = !fleet.cloud;
+    racksPanel.hidden = robotsPanel.hidden = Boolean(fleet.cloud);
+    if (fleet.cloud) takeCloud(fleet);
   }
 
-  function takeCloud(told) {
-    const text = JSON.stringify(told.unknown);
-    if (unknown.dataset.told === text) return;
-    unknown.dataset.told = text;
-    unknown.replaceChildren(...told.unknown.map((each) => element("li", {}, `${each[0].toUpperCase()}${each.slice(1)}.`)));
+  function takeCloud(fleet) {
+    const text = JSON.stringify(fleet.unknown);
+    if (unknown.dataset.text === text) return;
+    unknown.dataset.text = text;
+    unknown.replaceChildren(...fleet.unknown.map((each) => element("li", {}, `${each[0].toUpperCase()}${each.slice(1)}.`)));
   }
 
   function takeServers(servers) {
@@ -167,10 +168,10 @@ export function fleetView(root) {
       element("h2", {}, name), element("div", { class: "dots", role: "img", "aria-label": `robots of ${name}` }));
   }
 
-  function takeRobots(told) {
+  function takeRobots(robots) {
     const present = new Set();
     const counts = {};
-    for (const [robot, server, , , , last] of told.slice(0, MAX_DOTS)) {
+    for (const [robot, server, , , , last] of robots.slice(0, MAX_DOTS)) {
       present.add(robot);
       counts[server] = (counts[server] ?? 0) + 1;
       let dot = dots.get(robot);
@@ -190,14 +191,14 @@ export function fleetView(root) {
     for (const each of racks.children) {
       each.querySelector(".dots").setAttribute("aria-label", `${counts[each.dataset.server] ?? 0} robots on ${each.dataset.server}`);
     }
-    const listed = told.slice(0, MAX_LISTED);
+    const listed = robots.slice(0, MAX_LISTED);
     robotRows.replaceChildren(...listed.map(([, server, , connected, commands, last, tenant, name]) => element("tr", {},
       element("td", {}, tenant), element("th", { scope: "row" }, name), element("td", {}, server),
       element("td", { class: "number" }, duration(connected)), element("td", { class: "number" }, number(commands)),
       element("td", {}, last))));
-    setText(robotsNote, told.length > MAX_LISTED ? `${MAX_LISTED} of ${told.length} robots are listed` : told.length ? "" : "No robot is connected.");
-    setText(racksNote, told.length > MAX_DOTS ? `${MAX_DOTS} of ${told.length} robots are drawn`
-      : told.length ? "One dot is one robot; an outline says that it has just moved, a square that its last command failed." : "No robot is connected.");
+    setText(robotsNote, robots.length > MAX_LISTED ? `${MAX_LISTED} of ${robots.length} robots are listed` : robots.length ? "" : "No robot is connected.");
+    setText(racksNote, robots.length > MAX_DOTS ? `${MAX_DOTS} of ${robots.length} robots are drawn`
+      : robots.length ? "One dot is one robot; an outline says that it has just moved, a square that its last command failed." : "No robot is connected.");
   }
 
   function takeEvent(event) {

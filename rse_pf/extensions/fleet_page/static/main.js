@@ -1,4 +1,4 @@
-// Open the session, follow the stream, and give each message to the views.
+// The entry point of the page: it opens the session, reads the stream, and passes each message to the views.
 
 import { byId, confirmed, element, setText, toast } from "./dom.js";
 import { eventsView } from "./events.js";
@@ -18,7 +18,7 @@ const views = {
 };
 let liveMap = "";
 let aborted = new AbortController();
-let lastHeard = 0;
+let lastMessageMs = 0; // time of the last message of the stream, by performance.now(); 0 before the first one
 
 function show(name) {
   for (const each of VIEWS) {
@@ -84,13 +84,15 @@ function operatorChanged() {
   views.fleet.operatorChanged();
 }
 
+// Show the state of the connection to the platform.
 function linked(on, text) {
   byId("link").dataset.state = on ? "on" : "off";
   setText(byId("link"), text);
 }
 
+// Pass a message of the stream to the views that show its topic.
 function take({ topic, key, value }) {
-  lastHeard = performance.now();
+  lastMessageMs = performance.now();
   if (topic === "fleet") {
     setText(byId("platform"), value.platform);
     document.title = `${value.platform}: ${value.robots ?? "?"} robots`;
@@ -107,14 +109,16 @@ function take({ topic, key, value }) {
   else if (topic.startsWith("live/")) views.map.take(key, value);
 }
 
+// Hide the views and the button that the page of a deployment on AWS does not have: maps and poses stay on the servers,
+// and the page cannot operate them.
 function onlyCloud() {
-  // Maps and poses stay on the servers, and this page changes nothing there.
   if (!isShown("map")) return;
   for (const name of ["map", "poses"]) byId(`tab-${name}`).hidden = true;
   byId("operate").hidden = true;
   if (!byId("view-map").hidden || !byId("view-poses").hidden) show("fleet");
 }
 
+// Subscribe to the live map *name*, none if it is empty: the stream is requested again with other topics.
 function changeMap(name) {
   liveMap = name;
   aborted.abort();
@@ -136,11 +140,12 @@ async function run() {
       if (error.name === "AbortError") continue;
     }
     if (ended.status === 401) return needsKey();
-    linked(false, ended.status === 503 ? ended.told.message : "the page's server does not answer");
+    linked(false, ended.status === 503 ? ended.body.message : "the page's server does not answer");
     await new Promise((resolve) => setTimeout(resolve, 1000));
   }
 }
 
+// Show that the page has no valid session, instead of the views.
 function needsKey() {
   forget();
   linked(false, "no session");
@@ -153,6 +158,6 @@ function needsKey() {
 }
 
 setInterval(() => {
-  if (lastHeard && performance.now() - lastHeard > 12000) linked(false, "nothing heard for 12 s");
+  if (lastMessageMs && performance.now() - lastMessageMs > 12000) linked(false, "no message for 12 s");
 }, 1000);
 run();

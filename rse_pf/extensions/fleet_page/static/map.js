@@ -1,15 +1,17 @@
-// The Map view: a live map as it grows, or a version; three.js is loaded when the view is shown first.
+// The Map view: a live map as it grows, or a stored version.  three.js is loaded when the view is first shown, or
+// shortly after another view was.
 
 import { byId, clock, element, setText } from "./dom.js";
 import { ask, get } from "./session.js";
 
-const PREPARE_MS = 300; // after the first view has been filled
-const GROW_MS = 5000; // between two looks for a new version of a live map
-const STATE_MS = 1500; // so long after the stream began, what is told is the state, not news
+const PREPARE_MS = 300; // delay after the stream began before three.js and the list of maps are loaded
+const GROW_MS = 5000; // time between two checks for a new version of a live map
+const STATE_MS = 1500; // alignments within this time after the stream began are the present state, not new events
 
+// Create the view in the element *root*; changeMap(name) subscribes to a live map, "" to none.
 export function mapView(root, changeMap) {
   const choice = element("select", { "aria-label": "Map", onchange: choose });
-  const canvas = element("canvas", { tabindex: "0", role: "img", "aria-label": "Map. Arrow keys turn it, plus and minus come nearer and go back." });
+  const canvas = element("canvas", { tabindex: "0", role: "img", "aria-label": "Map. Arrow keys rotate it, plus and minus zoom." });
   const labels = element("div", { class: "maplabels", "aria-hidden": "true" });
   const note = element("div", { class: "soft", "aria-live": "polite" });
   const robots = element("tbody");
@@ -40,7 +42,7 @@ export function mapView(root, changeMap) {
 
   const newestOf = (map) => known.maps.find((each) => each.map === map)?.versions[0]?.id ?? "";
 
-  // A live map that was published again is shown with its new cloud.
+  // Load the new cloud of the live map that is shown, if a new version of it was published.
   async function grow() {
     if (!visible || document.hidden || !chosen.startsWith("live:")) return;
     await readMaps();
@@ -54,7 +56,7 @@ export function mapView(root, changeMap) {
     if (chosen && !isLoaded) await load();
   }
 
-  // What only this view needs is made ready when the page has shown another one.
+  // Load the modules of this view, once; return a promise that resolves when the scene can draw.
   function prepared() {
     preparing ??= Promise.all([import("./scene.js"), import("./cloud.js")]).then(([{ MapScene }, cloud]) => {
       ({ readCloud } = cloud);
@@ -66,7 +68,7 @@ export function mapView(root, changeMap) {
 
   async function prepare() {
     if (preparing || byId("tab-map").hidden) return;
-    await Promise.all([prepared(), get("/page/maps")]); // whose server packs the first map meanwhile
+    await Promise.all([prepared(), get("/page/maps")]); // this request also lets the server pack the first map
   }
 
   async function readMaps() {
@@ -83,9 +85,9 @@ export function mapView(root, changeMap) {
     for (const { map, versions } of known.maps) {
       for (const version of versions.slice(0, 20)) options.push([`version:${map}:${version.id}`, `${map}, version ${version.number}${version.points ? "" : ", no points"}`]);
     }
-    const told = JSON.stringify(options);
-    if (choice.dataset.told === told) return;
-    choice.dataset.told = told;
+    const text = JSON.stringify(options);
+    if (choice.dataset.options === text) return;
+    choice.dataset.options = text;
     choice.replaceChildren(...options.map(([value, title]) => element("option", { value }, title)));
     if (!options.some(([value]) => value === chosen) || !chosen) {
       const first = options[1]?.[0] ?? "";
@@ -120,7 +122,7 @@ export function mapView(root, changeMap) {
     const answer = await ask(`/page/cloud?${new URLSearchParams({ map, version: version ?? "" })}`);
     if (!answer.ok) { setText(note, (await answer.json()).message); return; }
     let sample = null;
-    const told = await readCloud(answer, () => chosen === wanted, (head) => {
+    const header = await readCloud(answer, () => chosen === wanted, (head) => {
       scene.begin(head, kind === "version");
       if (kind === "live") scene.update(state);
       sample = scene.drawn(Math.min(head.points, head.block)).then(() => {
@@ -132,20 +134,20 @@ export function mapView(root, changeMap) {
         robots.replaceChildren(...Object.entries(head.robots).map(([name, path]) => row(name, `${path.length} keyframes`)));
       }
     }, (bytes, count) => scene.more(bytes, count));
-    if (!told) return;
+    if (!header) return;
     await sample;
-    await scene.drawn(told.points);
+    await scene.drawn(header.points);
     if (chosen !== wanted) return;
     performance.mark("map-whole");
     note.dataset.points = "all";
     newest = newestOf(map);
-    if (!told.points) {
-      const count = Object.values(told.robots).reduce((sum, path) => sum + path.length, 0);
-      setText(note, `This version has no points: ${count} keyframes of ${Object.keys(told.robots).length} robots.`);
+    if (!header.points) {
+      const count = Object.values(header.robots).reduce((sum, path) => sum + path.length, 0);
+      setText(note, `This version has no points: ${count} keyframes of ${Object.keys(header.robots).length} robots.`);
       return;
     }
-    const all = told.all_points > told.points ? ` of ${told.all_points.toLocaleString("en")}` : "";
-    setText(note, `${told.points.toLocaleString("en")}${all} points in ${seconds()} s`);
+    const all = header.all_points > header.points ? ` of ${header.all_points.toLocaleString("en")}` : "";
+    setText(note, `${header.points.toLocaleString("en")}${all} points in ${seconds()} s`);
   }
 
   const row = (name, text) => element("tr", {}, element("th", { scope: "row" },
@@ -163,11 +165,11 @@ export function mapView(root, changeMap) {
     if (value.kind === "alignment") {
       const moved = before && before.segment === value.segment && before.T_map_odom && value.T_map_odom ? distance(before.T_map_odom, value.T_map_odom) : null;
       const isNews = before !== undefined || performance.now() - openedAt > STATE_MS;
-      if (value.aligned && !before?.aligned) { if (isNews) tell(`${value.robot} joined the map`); }
-      else if (!value.aligned && before?.aligned) tell(`${value.robot} left the map: ${value.reason}`);
-      else if (moved > 0.001) tellCorrection(value.robot, value.cause?.robot, moved);
+      if (value.aligned && !before?.aligned) { if (isNews) addEntry(`${value.robot} joined the map`); }
+      else if (!value.aligned && before?.aligned) addEntry(`${value.robot} left the map: ${value.reason}`);
+      else if (moved > 0.001) addCorrection(value.robot, value.cause?.robot, moved);
     }
-    if (value.kind === "map") setText(note, `${value.keyframes} keyframes, ${value.state}${value.owner ? `, owner ${value.owner}` : ""}${scene?.hasCloud ? "" : "; squares of 1 m"}`);
+    if (value.kind === "map") setText(note, `${value.keyframes} keyframes, ${value.state}${value.owner ? `, served by ${value.owner}` : ""}${scene?.hasCloud ? "" : "; squares of 1 m"}`);
     if (!due) { due = true; requestAnimationFrame(drawState); }
   }
 
@@ -188,17 +190,19 @@ export function mapView(root, changeMap) {
     robots.replaceChildren(...rows);
   }
 
-  // Corrections of one robot by one other within a minute are one line, so that joins stay in sight.
-  function tellCorrection(robot, cause, moved) {
+  // Add a correction of *robot*, caused by a keyframe of the robot *cause*, that moved it by *moved* metres.  All
+  // corrections of the same robots within a minute share one entry, so that entries about joins remain visible.
+  function addCorrection(robot, cause, moved) {
     const same = entries.find((each) => each.robot === robot && each.cause === cause && Date.now() / 1000 - each.time < 60);
     const [count, most] = [(same?.count ?? 0) + 1, Math.max(same?.most ?? 0, moved)];
     entries = entries.filter((each) => each !== same);
     const times = count === 1 ? "was moved by" : `was moved ${count} times, by at most`;
     const by = cause ? `, by ${count === 1 ? "a keyframe" : "keyframes"} of ${cause === robot ? "its own" : cause}` : "";
-    tell(`${robot} ${times} ${(most * 100).toFixed(1)}\u00a0cm${by}`, { robot, cause, count, most });
+    addEntry(`${robot} ${times} ${(most * 100).toFixed(1)}\u00a0cm${by}`, { robot, cause, count, most });
   }
 
-  function tell(text, more = {}) {
+  // Show *text* as the newest of at most 12 entries under "Joins and corrections".
+  function addEntry(text, more = {}) {
     entries = [{ text, time: Date.now() / 1000, ...more }, ...entries].slice(0, 12);
     log.replaceChildren(...entries.map((each) => element("div", {}, element("time", { class: "soft" }, clock(each.time)), ` ${each.text}`)));
   }
@@ -217,6 +221,7 @@ export function mapView(root, changeMap) {
   };
 }
 
+// Return the distance between the positions of two poses, each 16 numbers of a 4x4 matrix, in metres.
 function distance(a, b) {
   return Math.hypot(a[3] - b[3], a[7] - b[7], a[11] - b[11]);
 }

@@ -1,18 +1,19 @@
-// The Poses view: weak and failed commands as they come; one of them opens the replay of that very command.
+// The Poses view: a list of weak and failed commands; a click on a command opens the replay of that command.
 
 import { byId, clock, element, number, state } from "./dom.js";
 import { get } from "./session.js";
 
-const KEPT = 500;
-const SHOWN = 200;
+const KEPT = 500; // largest number of commands in memory
+const SHOWN = 200; // largest number of commands in the list
 
+// Create the view in the element *root*; *count* is the element with the number of unseen commands.
 export function posesView(root, count) {
   let rows = [];
   let unseen = 0;
   let due = false;
   const word = element("input", { type: "search", placeholder: "robot, reason", "aria-label": "Only commands that contain", oninput: draw });
   const body = element("tbody");
-  const empty = element("div", { class: "empty" }, "No command was weak or failed since this page began to look.");
+  const empty = element("div", { class: "empty" }, "No command was weak or failed since this page was opened.");
   root.append(element("div", { class: "panel" },
     element("div", { class: "filters" }, element("h2", {}, "Weak and failed commands"), word,
       element("span", { class: "soft" }, "Choose one to see why (needs rse-pf local --record).")),
@@ -45,20 +46,20 @@ export function posesView(root, count) {
       element("div", { class: "end" }, element("button", { onclick: () => dialog.close(), autofocus: true }, "Close")));
     dialog.showModal();
     try {
-      const told = await get(`/page/replay?${new URLSearchParams({ trace: row.trace ?? "", id: String(row.id ?? ""), time_s: String(row.time_s), bytes: String(row.bytes_in ?? 0) })}`);
-      place.replaceChildren(...replayed(told));
+      const replay = await get(`/page/replay?${new URLSearchParams({ trace: row.trace ?? "", id: String(row.id ?? ""), time_s: String(row.time_s), bytes: String(row.bytes_in ?? 0) })}`);
+      place.replaceChildren(...replayElements(replay));
     } catch (error) {
       place.replaceChildren(element("p", {}, error.message));
     }
   }
 
-  function replayed(told) {
-    const parts = [element("p", { id: "replay-equal" }, told.equal === null ? "The answer was not recorded." : told.equal
+  function replayElements(replay) {
+    const parts = [element("p", { id: "replay-equal" }, replay.equal === null ? "The answer was not recorded." : replay.equal
       ? "Solved again: the answer is the same, byte for byte." : "Solved again: the answer differs from the one that was sent.")];
-    if (told.picture) parts.push(element("p", {}, element("img", { src: told.picture, alt: "matches: inliers and outliers" })),
-      element("p", { class: "soft" }, "Blue dots agree with the pose, orange crosses do not; a line leads to where the pose puts the point."));
-    for (const line of told.lines ?? []) parts.push(element("div", { class: "soft" }, line));
-    if (told.command) parts.push(element("p", { class: "soft" }, "On the command line: ", element("code", {}, `rse-pf replay ${told.path} --command ${told.command}`)));
+    if (replay.picture) parts.push(element("p", {}, element("img", { src: replay.picture, alt: "matches: inliers and outliers" })),
+      element("p", { class: "soft" }, "Blue dots are inliers, orange crosses are outliers; a line leads to the pixel at which the pose projects the point."));
+    for (const line of replay.lines ?? []) parts.push(element("div", { class: "soft" }, line));
+    if (replay.command) parts.push(element("p", { class: "soft" }, "On the command line: ", element("code", {}, `rse-pf replay ${replay.path} --command ${replay.command}`)));
     return parts;
   }
 

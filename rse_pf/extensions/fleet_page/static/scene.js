@@ -1,4 +1,5 @@
-// Draw a map with three.js: the cloud, trajectories, robots with their covariance; own camera control with keys.
+// Draw a map with three.js: the point cloud, trajectories, and robots with the covariance of their alignment.  The
+// camera is controlled by pointer and keys.
 
 import { Cloud } from "./cloud.js";
 import {
@@ -6,17 +7,17 @@ import {
   PerspectiveCamera, Points, PointsMaterial, Scene, SphereGeometry, Spherical, Vector3, WebGLRenderer,
 } from "./vendor/three.module.js";
 
-// Okabe and Ito's colours, which colour-blind people tell apart; names stand beside them in any case.
+// Colours of robots, distinct for colour-blind people as well (Okabe and Ito 2008); names are drawn in any case.
 const COLOURS = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"];
-const MAX_FPS = 30;
-const FEWEST_POINTS = 50_000;
-const FILLING_POINTS = 200_000; // at least, in a frame while nothing moves
-const SLOW_MS = 70; // a frame takes so long: the next one draws fewer points
-const FAST_MS = 40;
-const CLOUD_LAYER = 1;
-const HOME = [0.95, 0.6]; // angles of the first view, from above and around
-const MARGIN = 0.88; // names stand beside robots
-ColorManagement.enabled = false; // nothing is lit: the colours of cameras are shown as they are
+const MAX_FPS = 30; // largest number of frames per second
+const FEWEST_POINTS = 50_000; // smallest number of points of a frame while the view changes
+const FILLING_POINTS = 200_000; // smallest number of points that a frame adds while the view does not change
+const SLOW_MS = 70; // after a longer time between frames, the next frame draws fewer points
+const FAST_MS = 40; // after a shorter time between frames, the next frame draws more points
+const CLOUD_LAYER = 1; // three.js layer of the cloud: alone, it is drawn over the previous frame
+const HOME = [0.95, 0.6]; // spherical angles of the first view, in radians: from the vertical, and around it
+const MARGIN = 0.88; // part of the canvas that the map fills in the first view, so that names of robots fit
+ColorManagement.enabled = false; // there is no lighting: the colours of the camera images are shown unchanged
 
 export class MapScene {
   constructor(canvas, labels) {
@@ -41,14 +42,14 @@ export class MapScene {
     this.shown = null;
     this.waiting = [];
     this.budget = FEWEST_POINTS;
-    this.isFilling = false; // whether the newest frame added points to the one before
-    this.count = 0; // points of the cloud that are in the picture
+    this.isFilling = false; // whether the newest frame added points to the previous one
+    this.count = 0; // number of points of the cloud that are on the canvas
     this.listen();
     this.themed();
     new ResizeObserver(() => { this.dirty = true; }).observe(canvas);
   }
 
-  // Have the programs compiled that draw a cloud, which takes longer than drawing it.
+  // Let the graphics driver compile the shaders for a cloud now, which takes longer than drawing it.
   warmUp() {
     const cloud = new Cloud({ points: 1, step: [1, 1, 1], low: [0, 0, 0] });
     cloud.take(new Uint8Array(9), 1);
@@ -61,7 +62,7 @@ export class MapScene {
   }
 
   themed() {
-    // A background of the scene would be painted over what was drawn before.
+    // Not scene.background, which would be drawn over the points of the previous frame.
     this.renderer.setClearColor(new Color(getComputedStyle(document.documentElement).getPropertyValue("--panel").trim()), 1);
     this.dirty = true;
   }
@@ -78,22 +79,23 @@ export class MapScene {
     this.dirty = true;
   }
 
-  // Prepare for the cloud of which *told* is the head; its blocks follow by more().
-  begin(told, withPaths) {
+  // Show the cloud with the header *header*, whose points are added by more(); *withPaths* also draws its trajectories.
+  begin(header, withPaths) {
     this.dropCloud();
-    this.shown = new Cloud(told);
+    this.shown = new Cloud(header);
     this.shown.points.layers.enable(CLOUD_LAYER);
     this.world.add(this.shown.points);
-    this.turnUp(new Vector3(...told.up));
-    if (withPaths) Object.entries(told.robots).forEach(([name, path]) => this.path(this.world, name, path));
-    this.cloudReach = cornersOf(told.fit);
-    if (withPaths) this.cloudReach.push(...Object.values(told.robots).flat().map((each) => new Vector3(...each)));
-    this.hasCloud = told.points > 0;
+    this.turnUp(new Vector3(...header.up));
+    if (withPaths) Object.entries(header.robots).forEach(([name, path]) => this.path(this.world, name, path));
+    this.cloudReach = cornersOf(header.fit);
+    if (withPaths) this.cloudReach.push(...Object.values(header.robots).flat().map((each) => new Vector3(...each)));
+    this.hasCloud = header.points > 0;
     this.fit(this.robotReach);
     if (!this.touched) this.home();
   }
 
-  // Take what must be seen: the cloud, the paths and the robots.
+  // Compute centre and radius of the points that the first view must show: the cloud and *robotReach*, the positions
+  // of robots and their paths.
   fit(robotReach) {
     this.robotReach = robotReach;
     const all = [...this.cloudReach, ...robotReach].map((each) => each.clone().applyMatrix4(this.world.matrix));
@@ -104,7 +106,7 @@ export class MapScene {
     this.radius = Math.max(box.getSize(new Vector3()).length() / 2, 0.5);
   }
 
-  // Return from how far away all of it is in the picture, in the direction of home.
+  // Return the distance in metres from which the first view shows all points of fit().
   distance() {
     const back = new Vector3().setFromSpherical(new Spherical(1, ...HOME));
     const right = new Vector3(0, 1, 0).cross(back).normalize();
@@ -124,17 +126,19 @@ export class MapScene {
     this.shown = null;
   }
 
-  // Return when a picture with *count* points of the cloud has been drawn, or the cloud is no longer shown.
+  // Return a promise that resolves when *count* points of the cloud are on the canvas, or the cloud is not shown any more.
   drawn(count) {
     const cloud = this.shown;
     return new Promise((resolve) => { this.waiting.push({ cloud, count, resolve }); });
   }
 
+  // Rotate the world so that the direction *up* of the map points upward on the screen.
   turnUp(up) {
     this.world.quaternion.setFromUnitVectors(up.lengthSq() > 1e-9 ? up.normalize() : new Vector3(0, -1, 0), new Vector3(0, 1, 0));
     this.world.updateMatrix();
   }
 
+  // Return the colour of the robot *name*, which is assigned at the first call.
   colour(name) {
     if (!this.places.has(name)) this.places.set(name, { colour: COLOURS[this.places.size % COLOURS.length], label: null, at: null });
     return this.places.get(name).colour;
@@ -148,6 +152,7 @@ export class MapScene {
     return line;
   }
 
+  // Put the label of the robot *name* at the position *at*; null hides it.
   place(name, at) {
     const known = this.places.get(name);
     known.at = at;
@@ -159,6 +164,7 @@ export class MapScene {
     }
   }
 
+  // Draw the robots of a live map again; *state* maps the keys of its topic to their values.
   update(state) {
     this.moving.traverse((each) => { each.geometry?.dispose(); each.material?.dispose(); });
     this.moving.clear();
@@ -194,13 +200,13 @@ export class MapScene {
     this.dirty = true;
   }
 
-  // A line, and a dot for each pose, since a line of WebGL is one pixel wide.
+  // Return the objects of a path: a line, and a dot for each pose, since lines of WebGL are only one pixel wide.
   drive(points, color) {
     const geometry = new BufferGeometry().setFromPoints(points);
     return [new Line(geometry, new LineBasicMaterial({ color })), new Points(geometry, new PointsMaterial({ color, size: 5, sizeAttenuation: false }))];
   }
 
-  // Squares of 1 m below the robots, which tell the scale as long as there is no cloud.
+  // Return a grid with squares of 1 m below the robots, which shows the scale while there is no cloud.
   grid(centre, reach) {
     const metres = 2 * Math.ceil(this.radius + 1);
     const line = getComputedStyle(document.documentElement).getPropertyValue("--line").trim();
@@ -209,7 +215,8 @@ export class MapScene {
     return grid;
   }
 
-  // A sphere of 4 cm, and around it the ellipsoid of three standard deviations along the map's axes.
+  // Return a robot: a sphere with a radius of 4 cm, and around it an ellipsoid of three standard deviations of the
+  // position along the map's axes (half axes of 4.5 cm to 3 m).
   robot(at, colour, covariance) {
     const group = new Group();
     group.position.copy(at);
@@ -223,6 +230,7 @@ export class MapScene {
     return group;
   }
 
+  // Return to the first view, which shows the whole map.
   home() {
     this.target.copy(this.centre ?? new Vector3());
     this.orbit.set(this.distance(), ...HOME);
@@ -270,6 +278,7 @@ export class MapScene {
     });
   }
 
+  // Start or stop drawing.
   run(on) {
     this.running = on;
     if (on && !this.looping) { this.looping = true; this.dirty = true; this.loop(0); }
@@ -281,14 +290,14 @@ export class MapScene {
     const since = now - (this.drawnAt ?? 0);
     const isWhole = this.count >= (this.shown?.ready ?? 0);
     if ((!this.dirty && isWhole) || since < 1000 / MAX_FPS) return;
-    // Frames that follow each other tell how long one takes.
+    // The time between successive frames is a measure of the time that a frame takes.
     if (since < FAST_MS) this.budget = Math.min(this.budget * 1.2, 1e9);
     else if (since > SLOW_MS && since < 1000 && !this.isFilling) this.budget = Math.max(FEWEST_POINTS, this.budget * 0.7);
     this.drawnAt = now;
     this.draw();
   }
 
-  // Draw a new picture if something changed, else put the next points of the cloud into the one that is there.
+  // Draw a new frame if something changed; otherwise add the next points of the cloud to the previous frame.
   draw() {
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     if (!width || !height) return;
@@ -311,7 +320,7 @@ export class MapScene {
     this.count += this.shown?.show(this.count, this.isFilling ? Math.max(this.budget, FILLING_POINTS) : this.budget) ?? 0;
     this.renderer.render(this.scene, this.camera);
     this.frames += 1;
-    this.tell();
+    this.resolveWaiting();
     for (const [, { label, at }] of this.places) {
       if (!label) continue;
       const seen = at?.clone().applyMatrix4(this.world.matrix).project(this.camera);
@@ -320,25 +329,25 @@ export class MapScene {
     }
   }
 
-  // Tell those that wait for a picture with *count* points, once it is on the canvas.
-  tell() {
+  // Resolve the promises of drawn() whose number of points is on the canvas.
+  resolveWaiting() {
     const done = this.waiting.filter((each) => each.cloud !== this.shown || this.count >= each.count);
     if (!done.length) return;
     const gl = this.renderer.getContext();
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until it is drawn
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until the frame is drawn
     this.waiting = this.waiting.filter((each) => !done.includes(each));
     for (const each of done) each.resolve();
   }
 }
 
-// Smooth edges only where a graphics card draws: a processor would take four times as long.
+// Return a WebGL 2 context, with antialiasing only on a graphics card: software rendering would take four times as long.
 function contextOf(canvas) {
   const wanted = { alpha: true, depth: true, stencil: false, powerPreference: "low-power", preserveDrawingBuffer: true };
   return canvas.getContext("webgl2", { ...wanted, antialias: true, failIfMajorPerformanceCaveat: true })
     ?? canvas.getContext("webgl2", { ...wanted, antialias: false });
 }
 
-// Return the eight corners of a box, none of no box.
+// Return the eight corners of the box with the corners *fit* (lowest, highest); none without a box.
 function cornersOf(fit) {
   if (!fit?.length) return [];
   const [low, high] = fit;

@@ -1,4 +1,5 @@
-// The session of this page: opened by the one-time key behind "#", kept for this origin only, sent in a header.
+// The session of this page.  It is opened with the one-time key after "#" in the address, stored for this origin only,
+// and sent in a header.
 
 const NAME = "rse-pf session";
 let role = sessionStorage.getItem(`${NAME} role`) ?? "view";
@@ -6,15 +7,16 @@ let role = sessionStorage.getItem(`${NAME} role`) ?? "view";
 export const isOperator = () => role === "operate";
 export const hasSession = () => sessionStorage.getItem(NAME) !== null;
 
+// Open a session with the key in the address; return whether the page has a session, also one from before.
 export async function openSession() {
   const key = new URLSearchParams(location.hash.slice(1)).get("key");
   if (!key) return hasSession();
   history.replaceState(null, "", location.pathname);
   const answer = await fetch("/session", { method: "POST", body: JSON.stringify({ key }) });
   if (!answer.ok) return hasSession();
-  const told = await answer.json();
-  sessionStorage.setItem(NAME, told.session);
-  keepRole(told.role);
+  const opened = await answer.json();
+  sessionStorage.setItem(NAME, opened.session);
+  keepRole(opened.role);
   return true;
 }
 
@@ -22,38 +24,41 @@ export function forget() {
   sessionStorage.removeItem(NAME);
 }
 
-function keepRole(told) {
-  role = told;
-  sessionStorage.setItem(`${NAME} role`, told);
+function keepRole(newRole) {
+  role = newRole;
+  sessionStorage.setItem(`${NAME} role`, newRole);
 }
 
+// Send a request with the session in its header; return the response.
 export async function ask(path, options = {}) {
   const headers = { Authorization: `Bearer ${sessionStorage.getItem(NAME)}` };
   return fetch(path, { ...options, headers, cache: "no-store" });
 }
 
-async function told(answer) {
+// Return the JSON body of *answer*; throw its message and hint as an error if its status is one.
+async function jsonOf(answer) {
   const value = await answer.json();
   if (!answer.ok) throw new Error(value.hint ? `${value.message} (${value.hint})` : value.message);
   return value;
 }
 
 export async function post(path, value) {
-  return told(await ask(path, { method: "POST", body: JSON.stringify(value) }));
+  return jsonOf(await ask(path, { method: "POST", body: JSON.stringify(value) }));
 }
 
 export async function get(path) {
-  return told(await ask(path));
+  return jsonOf(await ask(path));
 }
 
 export async function becomeOperator(key) {
   keepRole((await post("/operator", { key })).role);
 }
 
-// Calls take(message) for each event of the stream until it ends; returns the status of the answer.
+// Request the stream of *topics*: call opened() once, then take(message) for each message until the stream ends.
+// Return the HTTP status, and the body if it is an error.
 export async function follow(topics, take, opened, signal) {
   const answer = await ask(`/stream?topics=${encodeURIComponent(topics.join(","))}`, { signal });
-  if (!answer.ok) return { status: answer.status, told: await answer.json() };
+  if (!answer.ok) return { status: answer.status, body: await answer.json() };
   opened();
   const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "";
