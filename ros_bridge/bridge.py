@@ -290,7 +290,7 @@ class Bridge:
     def _silence(self, before: Counter[str], frames_before: int) -> str:
         """Return a sentence with the image topics that sent no message since the counts *before*.
 
-        Empty if each sent one, or if a frame was tracked since.
+        The text is empty if each topic sent a message, or if a frame was tracked since.
         """
         if self.frames != frames_before:
             return ""

@@ -265,9 +265,9 @@ class IncomingFrames:
         return f"colours have no {name} within {self._options.pair_within_s:g} s"
 
     def _is_stamp_wrong(self, role: Role, stamp_ns: int) -> bool:
-        """Return whether a time stamp is not set, or equals that of the previous image of the topic.
+        """Return whether the time stamp of an image is not set, or equals that of the topic's previous image.
 
-        Count it.
+        Such an image is counted in ``check`` as invalid.
         """
         before_ns, self._newest_ns[role] = self._newest_ns.get(role), stamp_ns
         if stamp_ns <= 0:

@@ -151,10 +151,7 @@ class BridgeOptions:
 
     @property
     def partner(self) -> Literal["right", "depth", ""]:
-        """The role of the second image of a frame: "right" for a stereo pair, else "depth".
-
-        Empty for none.
-        """
+        """The role of the second image of a frame: "right" for a stereo pair, "depth", or empty for none."""
         return "right" if self.right else "depth" if self.depth else ""
 
     def check_rig(self, *, has_right: bool, has_imu: bool) -> None:
@@ -192,7 +189,7 @@ class BridgeOptions:
     def own_odom_frame(self) -> str:
         """The name of the odometry frame with the robot's namespace before it.
 
-        ROS adds none to frame names.
+        It is put there because ROS adds namespaces to names of topics, but not to names of frames.
         """
         prefix = self.namespace.strip("/")
         return f"{prefix}/{self.odom_frame}" if prefix else self.odom_frame

@@ -191,7 +191,8 @@ class OutgoingMessages:
     def _extend_path(self, stamp_ns: int, T_odom_camera: Array) -> None:
         """Add a pose to the path.
 
-        Above ``path_poses``, drop every second pose and add later ones half as often.
+        If the path has more than ``path_poses`` poses, drop every second one, and add later ones half as
+        often.
         """
         self._counted += 1
         if self._counted % self._every:

@@ -157,7 +157,7 @@ def start_process(
 ) -> tuple[BaseProcess, Connection]:
     """Start ``target(spec, pipe)`` in a new spawned daemon process.
 
-    Return the process and the parent's pipe end.
+    Return the process and the parent's end of the pipe.
     """
     context = multiprocessing.get_context("spawn")
     pipe, child_pipe = context.Pipe()
@@ -170,7 +170,7 @@ def start_process(
 def end_process(process: BaseProcess, pipe: Connection, timeout_s: float) -> None:
     """Close *pipe* and wait up to *timeout_s* seconds until *process* exits.
 
-    Kill it if it is still running then.
+    A process that is still running after that time is killed.
     """
     pipe.close()
     process.join(timeout_s)

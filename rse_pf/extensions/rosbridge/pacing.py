@@ -42,7 +42,7 @@ class Pacing:
     def wait_s(self, now: float) -> float:
         """Return the seconds until the ping before the next message may be sent.
 
-        0 if it may be sent at *now*.
+        The result is 0 if the ping may be sent at *now*.
         """
         return max(0.0, self._next_s - now)
 

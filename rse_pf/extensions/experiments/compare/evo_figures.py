@@ -31,8 +31,8 @@ def evo_command() -> str | None:
 
     None if evo is not installed.
     """
-    beside = Path(sys.executable).with_name(_COMMAND)
-    return str(beside) if beside.is_file() else shutil.which(_COMMAND)
+    installed = Path(sys.executable).with_name(_COMMAND)
+    return str(installed) if installed.is_file() else shutil.which(_COMMAND)
 
 
 def evo_ate_cm(command: str, errors: Accuracy) -> float | None:

@@ -85,7 +85,7 @@ def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
         tolerance_line(),
         runs_line(rows, is_platform=options.platform),
         f"CPU of a frame: robot without reading its image, OpenCV on one thread; server: "
-        f"{'as its answers tell' if options.platform else 'with the codec'}; load average "
+        f"{'as its answers state' if options.platform else 'with the codec'}; load average "
         f"{before['load_average'][0]:g} before, {load_average()[0]:g} after",
         f"results: {options.out}/{REPORT}, {PICTURE}, {TRAJECTORIES}/",
     )

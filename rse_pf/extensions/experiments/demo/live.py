@@ -61,7 +61,7 @@ class LiveRecorder:
     async def finish(self, folder: Path, truth: Trajectory | None) -> None:
         """Write the records, and *truth* if it is known, to *folder*.
 
-        Called after the robot has left the map.
+        This is called after the robot has left the map.
         """
         await self._listening
         self._lines.append({"event": "end", **self._mapper.report()["live"]})

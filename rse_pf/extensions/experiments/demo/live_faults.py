@@ -72,9 +72,10 @@ class LiveFault:
         return self.name == "wifi"
 
     def settings(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return *settings* changed for this fault: the map's log is never shortened.
+        """Return *settings* changed for this fault: the map's log is kept completely.
 
         So it can be replayed.
+        For "wifi", the time within which a pose must be answered is 0.5 s.
         """
         changed = settings.replace(live={"keep_log": True})
         return (
@@ -133,7 +134,7 @@ class Disturbance:
     def url_of(self, robot: int) -> str:
         """Return the address for the robot of number *robot* (from 0).
 
-        One leads through the link that is cut.
+        For the fault "wifi", the first robot's address is that of the link which is cut.
         """
         if self._link is None or robot != _CUT_ROBOT:
             return self._platform.url

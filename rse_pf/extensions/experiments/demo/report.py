@@ -131,8 +131,8 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
         third += merged_lines(report["merged"])
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "
         third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
-    for name, told in report.get("checks", {}).items():
-        third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(told, shown))
+    for name, result in report.get("checks", {}).items():
+        third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(result, shown))
     if "live" in report:
         third += live_lines(report["live"], report["robots"])
     return (
@@ -152,10 +152,7 @@ def _without_pose(report: Mapping[str, Any]) -> int:
 
 
 def advice(report: Mapping[str, Any]) -> str:
-    """Return a line of advice, with a newline, if at least a tenth of the frames was lost.
-
-    Else an empty text.
-    """
+    """Return a line of advice, with a newline, if at least a tenth of the frames was lost; otherwise ""."""
     asked = report["asked"]
     if report["lost_frames"] < _SOME * report["frames"] or not report["lost_frames"]:
         return ""

@@ -185,7 +185,7 @@ class _Drive:
 class _Loaded:
     """The frames that a robot plays, with their truth.
 
-    ``is_thinned`` if frames of the recording are skipped.
+    ``is_thinned`` says whether frames of the recording are skipped.
     """
 
     frames: Any

@@ -216,7 +216,7 @@ def _frame_rates(commands: list[CommandRecord], fps: float) -> list[float]:
 def table_of(report: Mapping[str, Any], folder: Path) -> str:
     """Return the main figures of *report* as the text that a terminal shows.
 
-    *folder* is named as their place.
+    The text also names *folder*, which holds the records.
     """
     commands, trip, own = report["commands"], report["round_trip_ms"], report["generator"]
     failures = ", ".join(f"{code} {count}" for code, count in report["failures_by_code"].items()) or "none"

@@ -169,7 +169,7 @@ class Harness:
     async def wait_quiet(self, quiet_s: float, timeout_s: float) -> bool:
         """Wait until no server was added, removed or replaced for *quiet_s*.
 
-        Return False after *timeout_s*.
+        Return False if that did not happen within *timeout_s*.
         """
 
         def quiet() -> bool:

@@ -437,7 +437,7 @@ def _first_answers(commands: Sequence[CommandRecord], healed_s: float) -> list[f
 def _growth(events: Sequence[Event]) -> dict[str, Any]:
     """Return the growth of memory and of file descriptors per process during the run, in percent.
 
-    None if unknown.
+    Both are None if the event ``resources`` is missing before or after the faults.
     """
     seen = {str(event["when"]): event for event in events if event["action"] == "resources"}
     if not {"before", "after"} <= set(seen):

@@ -121,9 +121,9 @@ def verify(folder: Path) -> list[FigureCheck]:
 
 
 def report_folders(folder: Path) -> list[Path]:
-    """Return *folder* if it has a report, else its folders that have one.
+    """Return the folders of experiments: *folder* if it has a report, else its subfolders that have one.
 
-    *folder* again if there are none.
+    If no subfolder has one either, the result is *folder*.
     """
     below = [report.parent for report in sorted(folder.glob("*/report.json"))]
     return [folder] if (folder / "report.json").exists() or not below else below

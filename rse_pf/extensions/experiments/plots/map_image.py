@@ -137,8 +137,8 @@ class _Observer:
         This is the mean viewing direction of the robots' cameras, or the short horizontal axis of a long
         scene.
         """
-        looks = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
-        mean = looks.mean(axis=0) if len(looks) else np.zeros(3)
+        directions = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
+        mean = directions.mean(axis=0) if len(directions) else np.zeros(3)
         level = np.eye(3) - np.outer(up, up)
         mean = level @ mean
         if len(points):

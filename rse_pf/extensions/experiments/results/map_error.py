@@ -130,7 +130,7 @@ def merge_section(
 def merged_lines(section: Mapping[str, Any]) -> str:
     """Return the lines about a merged map for the terminal, each with a newline.
 
-    *section* is `merge_section`.
+    *section* is the result of `merge_section`.
     """
     joined = section["joined"]
     what = (

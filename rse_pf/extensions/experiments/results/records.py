@@ -124,7 +124,7 @@ class SampleLog:
     def write(self, sample: MonitorSample) -> None:
         """Append a row for each server of *sample*.
 
-        Without servers, one row whose server columns are empty.
+        A sample without servers is one row whose server columns are empty.
         """
         head = [sample.time, sample.healthy_servers]
         for name, *values in (asdict(server).values() for server in sample.servers):

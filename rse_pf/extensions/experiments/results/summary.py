@@ -95,7 +95,7 @@ def percent_answered(commands: Sequence[CommandRecord], within_ms: float | None 
 def percentiles(values: Sequence[float]) -> dict[str, float | int | None]:
     """Return n, mean, p50, p95, p99 and maximum of *values*, rounded to three decimals.
 
-    None without values.
+    Without values, n is 0 and all others are None.
     """
     if not values:
         return {"n": 0, "mean": None, "p50": None, "p95": None, "p99": None, "max": None}

@@ -37,8 +37,7 @@ def buckets_of(page: str) -> Buckets:
 def percentile(buckets: Mapping[float, float], share: float) -> float | None:
     """Return the time in seconds within which the fraction *share* of the answers arrived.
 
-    None without answers.
-    Answers beyond the last finite bound count as that bound.
+    The result is None without answers.  Answers beyond the last finite bound count as that bound.
     """
     bounds = sorted(buckets)
     total = buckets[bounds[-1]] if bounds else 0.0
@@ -66,7 +65,7 @@ class LastMinute:
     def add(self, server: str, buckets: Buckets, *, now_s: float) -> None:
         """Add the histogram of *server* that was read at *now_s* (s).
 
-        After a restart, older ones are dropped.
+        If a count is lower than before, the server was restarted, and its older histograms are dropped.
         """
         snapshots = self._taken.setdefault(server, deque())
         if snapshots and any(buckets.get(bound, 0.0) < count for bound, count in snapshots[-1][1].items()):

@@ -186,7 +186,7 @@ class LocalFeed:
     async def _follow_metrics(self) -> None:
         """Read the histograms of all servers, also while no page is open.
 
-        So a new page has percentiles at once.
+        A page that is opened later thus has the percentiles of the last minute at once.
         """
         while True:
             with contextlib.suppress(*_UNREADABLE):
@@ -291,7 +291,7 @@ def _robot(tenant: str, name: str) -> str:
 def _mean_cpu(servers: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the mean CPU (%) of all servers that reported theirs, also those that warm up.
 
-    None without any.
+    The result is None if no server reported its CPU.
     """
     percents = [float(server["cpu_percent"]) for server in servers if server["cpu_percent"] is not None]
     return round(sum(percents) / len(percents), 1) if percents else None
