@@ -148,7 +148,9 @@ def _got(inbox: queue.SimpleQueue[T | None]) -> T:
     message = inbox.get()
     if message is None:
         inbox.put(None)  # so that every other thread that waits for this queue raises Disconnected as well
-        raise Disconnected("the demo has ended without this robot", hint="read the last lines of its output")
+        raise Disconnected(
+            "the parent of this robot's process has exited", hint="read the last lines of its output"
+        )
     return message
 
 

@@ -131,9 +131,8 @@ class FleetApp:
             self._check_origin(request)
             await self._answer(request, receive, send)
         except RsePfError as error:
-            with contextlib.suppress(
-                OSError, RuntimeError
-            ):  # raised if a part of the answer was sent already
+            # Sending fails with one of these exceptions if a part of the answer was sent already.
+            with contextlib.suppress(OSError, RuntimeError):
                 await _send(send, _STATUS.get(error.code, 400), _error_document(error))
 
     def _check_origin(self, request: _Request) -> None:
@@ -196,9 +195,8 @@ class FleetApp:
             raise BadRequest("a stream needs topics", hint=f"some of {', '.join(sorted(_TOPICS))}, live/MAP")
         messages = self._hub.messages(topics)
         async with contextlib.aclosing(messages):
-            first = (
-                await messages.__anext__()
-            )  # raises Busy before the answer begins, if too many pages are open
+            # Raises Busy, before the answer begins, if too many pages are open.
+            first = await messages.__anext__()
             await send(_start(200, b"text/event-stream", ((b"cache-control", b"no-store"),)))
             await send({"type": "http.response.body", "body": first, "more_body": True})
             sending = asyncio.ensure_future(self._send_messages(request, messages, send))

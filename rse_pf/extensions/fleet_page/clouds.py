@@ -153,9 +153,8 @@ def packer(configuration: str) -> Handler:
     def pack(data: bytes) -> bytes:
         version = decode_map(data, _MEMORY_BYTES // 2)
         order = spread_order(len(version.points))[:MAX_POINTS]
-        points = version.points.copy().take(
-            order, axis=0
-        )  # copied, since the map's array may be unaligned: slow
+        # Copied, since the array of the map may be unaligned in memory, which makes take() slow.
+        points = version.points.copy().take(order, axis=0)
         colours = version.colours.take(order, axis=0)
         low = np.array([points[:, axis].min() if len(points) else 0.0 for axis in range(3)], np.float32)
         high = np.array([points[:, axis].max() if len(points) else 0.0 for axis in range(3)], np.float32)

@@ -100,9 +100,9 @@ def serve_page(
         timeout_graceful_shutdown=_LONGEST_END_S, h11_max_incomplete_event_size=16384,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(
-            number, lambda number, frame: None
-        )  # uvicorn raises the signal again after it has stopped
+        # uvicorn handles the signals while it serves, and raises them again after it has stopped: without
+        # effect.
+        signal.signal(number, lambda number, frame: None)
 
     async def run() -> None:
         server = uvicorn.Server(config)

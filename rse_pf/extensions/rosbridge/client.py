@@ -258,9 +258,8 @@ class Client:
                 self._topics.execute(identity, operation)
         except Busy as error:
             await self._refuse(data, error)
-            await asyncio.sleep(
-                1e-3 * (error.retry_after_ms or 0.0)
-            )  # too many messages are not read meanwhile
+            # No message of this client is read during the pause.
+            await asyncio.sleep(1e-3 * (error.retry_after_ms or 0.0))
         except RsePfError as error:
             await self._refuse(data, error)
 

@@ -62,13 +62,12 @@ class TopicSender:
             while True:
                 await self._next_due()
                 await self._pace()
-                subscription = await self._next_due()  # the pong may have taken longer than a subscription
+                subscription = await self._next_due()  # chosen again: the first may be gone after the pong
                 del self._due[subscription]
                 message = subscription.take(self._clock())
                 if subscription:
-                    self._due[subscription] = (
-                        None  # its next message comes after those of other subscriptions
-                    )
+                    # The next message of this subscription is sent after those of other subscriptions.
+                    self._due[subscription] = None
                 await self._write(message)
                 if self._pacing.is_free and self._pong is None:
                     self._pong = asyncio.ensure_future(self._measure())

@@ -217,7 +217,7 @@ class Disturbance:
             if self._lease is not None and self._lease.state == "serving":
                 return self._lease
             await asyncio.sleep(_WATCH_S)
-        raise CommandFailed("no server owns the live map", hint="let the robots drive for longer")
+        raise CommandFailed("no server serves the live map", hint="let the robots drive for longer")
 
     async def _watch(self) -> None:
         """Record each change of the lease's holder or state, until cancelled; renewals are not recorded."""

@@ -262,7 +262,7 @@ async def _wait_for(
         elif isinstance(message, ChildFailed):
             raise message.error(robot.spec.name)
     raise CommandFailed(
-        f"the process of {robot.spec.name} ended early", hint="check the memory of this machine"
+        f"the process of {robot.spec.name} exited early", hint="check the memory of this machine"
     )
 
 
@@ -270,7 +270,7 @@ async def _messages(pipe: Connection) -> AsyncIterator[Any]:
     """Yield the messages of *pipe* until the other side closes it."""
     loop = asyncio.get_running_loop()
     readable = asyncio.Event()
-    number = pipe.fileno()  # a closed pipe has none
+    number = pipe.fileno()  # stored for the end, when the pipe is closed and has no file number any more
     loop.add_reader(number, readable.set)
     try:
         while True:

@@ -87,7 +87,7 @@ def _make_failing(
             return original(store, name, *rest, **named)
         if is_write and drawn < percent / 2:
             original(store, name, *rest, **named)
-        raise StoreError(f"{name!r}: the store fails by order", hint="this is an experiment")
+        raise StoreError(f"{name!r}: the store fails on purpose", hint="this is an experiment with faults")
 
     return operation
 

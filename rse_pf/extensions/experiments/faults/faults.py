@@ -192,9 +192,9 @@ def _wait_until_it_holds(child: subprocess.Popen[str]) -> None:
             return
         if "Error" in line:
             raise ConfigurationError(
-                f"nft refuses: {line.strip()[:200]}", hint="does the kernel have nf_tables?"
+                f"nft rejects the rules: {line.strip()[:200]}", hint="does the kernel have nf_tables?"
             )
-    raise ConfigurationError("nft ended at once", hint="does the kernel have nf_tables?")
+    raise ConfigurationError("nft exited without adding the rules", hint="does the kernel have nf_tables?")
 
 
 def _children(pid: int) -> list[int]:

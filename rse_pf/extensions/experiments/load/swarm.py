@@ -253,7 +253,7 @@ class Swarm:
             asyncio.get_running_loop().remove_reader(child.pipe.fileno())
             if child.ended is None and self._problem is None:
                 self._problem = CommandFailed(
-                    "a process of the swarm ended early", hint="check the memory of this machine"
+                    "a process of the swarm exited early", hint="check the memory of this machine"
                 )
         self._changed.set()
 

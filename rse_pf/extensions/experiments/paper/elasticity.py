@@ -125,7 +125,7 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
     chosen = settings.replace(
         serving={"emulated_cores": cores},
         local={"servers": settings.scaling.min_servers},
-        scaling={"profile": "paper", "underused_s": 0, "schedule": ""},  # the paper's rules alone
+        scaling={"profile": "paper", "underused_s": 0, "schedule": ""},  # only the rules of the paper
     )
     for part, rebalance in runs.values():
         asyncio.run(_run(options, chosen, part, rebalance))

@@ -88,7 +88,7 @@ def move_frames(path: Trajectory, stamps_s: Array, T_before: Array, T_after: Arr
     share = np.clip((path.timestamps_s - stamps_s[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0, 1.0)
     first, second = (corrections[rows] @ path.T_world_camera for rows in (before, after))
     mean = (1.0 - share)[:, None, None] * first + share[:, None, None] * second
-    U, _, Vt = np.linalg.svd(mean[:, :3, :3])  # the rotation nearest to the mean of two that are close
+    U, _, Vt = np.linalg.svd(mean[:, :3, :3])  # the rotation nearest to the mean of two similar ones
     mean[:, :3, :3] = U @ Vt
     return Trajectory(path.timestamps_s, mean)
 

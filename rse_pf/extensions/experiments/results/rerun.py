@@ -84,7 +84,7 @@ def rerun_figures(report: Mapping[str, Any], short: Mapping[str, Any]) -> list[F
 def _limit(bar: str, slack: float) -> tuple[str, float]:
     match = _BAR.fullmatch(bar)
     if match is None or slack < 1.0:
-        raise ValueError(f"{bar!r} with slack {slack:g} is no bar")
+        raise ValueError(f"{bar!r} with slack {slack:g} is no target of a figure")
     return match[1], float(match[2]) * (slack if match[1] == "<=" else 1.0 / slack)
 
 

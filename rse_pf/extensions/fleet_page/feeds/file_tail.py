@@ -48,7 +48,7 @@ class FileTail:
         self._read[key] = start + len(data)
         *lines, self._rest[key] = (self._rest.get(key, b"") + data).split(b"\n")
         self._rest[key] = self._rest[key][-_TAIL_BYTES:]
-        while len(self._read) > _MAX_FILES:  # most of them were deleted long ago
+        while len(self._read) > _MAX_FILES:  # the oldest entries are mostly of deleted files
             self._rest.pop(oldest := next(iter(self._read)), None)
             del self._read[oldest]
         return lines[1:] if is_cut else lines

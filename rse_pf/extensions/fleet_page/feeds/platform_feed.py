@@ -131,9 +131,8 @@ class LocalFeed:
         document = fleet_document(state, self._settings, time_s=now)
         for server in document["servers"]:
             server["age_s"] = _age_s(server["pid"])
-        if (
-            sample
-        ):  # the control plane's monotonic clock is that of this process, since both are on one machine
+        # Both processes run on one machine, so that the control plane has the same monotonic clock.
+        if sample:
             document["sample_age_s"] = round(time.monotonic() - float(sample["time"]), 3)
         document["percentiles"] = self._percentiles
         document["pages"] = self._hub.pages
