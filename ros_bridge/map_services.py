@@ -54,7 +54,7 @@ class MapServices:
             return dict(answer.reply)
         name = self._options.publish_as
         if not name:
-            raise UsageError("the map has no name", hint="set the parameter publish_as, or map")
+            raise UsageError("the robot's own map has no name", hint="set the parameter publish_as, or map")
         encoded = await asyncio.to_thread(self._mapper.encoded_map)
         version = await asyncio.to_thread(self._client.update_map, name, encoded, note="rse-pf-ros")
         return {"map": name, "version": version}
@@ -69,7 +69,7 @@ class MapServices:
             UsageError: The robot does not use a live map.
         """
         if not isinstance(self._mapper, LiveMapper):
-            raise UsageError("a map of its own begins where the robot did", hint="set the parameter map")
+            raise UsageError("this robot uses no live map to relocalise in", hint="set the parameter map")
         self._mapper.relocalise()
         return {"map": self._mapper.name, "aligned": self._mapper.aligned, "reason": self._mapper.reason}
 

@@ -51,7 +51,7 @@ def listen(port: int) -> socket.socket:
     for candidate in (port, 0):
         with contextlib.suppress(OSError):
             return socket.create_server((_LOOPBACK, candidate), backlog=BACKLOG)
-    raise ConfigurationError("no port on loopback is free", hint="end other programs")
+    raise ConfigurationError("no port on loopback is free", hint="close other programs")
 
 
 def serve_page(

@@ -140,7 +140,9 @@ def _from_values(
 ) -> Configuration:
     base = values.get("base", "default")
     if not isinstance(base, str):
-        raise UsageError("base is no name", hint=f"write one of {', '.join(BUILT_IN)}")
+        raise UsageError(
+            "base is not the name of a configuration", hint=f"write one of {', '.join(BUILT_IN)}"
+        )
     start = _built_in(base)
     depth = values.get("depth", start.depth)
     if depth is not None and not isinstance(depth, bool):

@@ -500,7 +500,9 @@ def _exchange(pipe: Connection, word: str | None) -> Any:
             return pipe.recv()
     except (EOFError, OSError):
         pass
-    raise ConfigurationError("the process of the link does not answer", hint="is the machine overloaded?")
+    raise ConfigurationError(
+        "the process of the emulated link does not answer", hint="is the machine overloaded?"
+    )
 
 
 def _run(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None:

@@ -239,7 +239,11 @@ def _rerun(folder: Path, settings: PlatformSettings) -> int:
         for figure in figures:
             show(f"{part.name}: {figure}" if part != folder else str(figure))
         missed += sum(not figure.is_reached for figure in figures)
-    show(f"{missed} figures of the reports are not reached by this version" if missed else "all are reached")
+    show(
+        f"{missed} figures of the reports are not reached by this version"
+        if missed
+        else "all figures are reached"
+    )
     return int(missed > 0)
 
 
