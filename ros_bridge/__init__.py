@@ -1,9 +1,9 @@
 """The bridge that makes a ROS robot a robot of the platform.
 
-It receives the images of topics and publishes poses, paths, transforms and clouds as topics.  The modules
-`options`, `incoming`, `outgoing` and `bridge` need no ROS: they receive and return the bytes of messages.
-The shells `ros1_node` (rospy) and `ros2_node` (rclpy) transport these bytes.  No package of the platform
-imports this one.
+The bridge receives the images of topics and publishes poses, paths, transforms and clouds as topics.  The
+modules `options`, `incoming`, `outgoing` and `bridge` need no ROS: they receive and return the bytes of
+messages. The shells `ros1_node` (rospy) and `ros2_node` (rclpy) transport these bytes.  No package of the
+platform imports this one.
 """
 
 from ros_bridge.bridge import Bridge, Publish

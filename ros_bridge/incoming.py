@@ -123,9 +123,9 @@ class PairedImages:
 class IncomingFrames:
     """Pairs the images of two topics into frames.
 
-    One thread may `add` while another one calls `take` and `decode`.
-    ``rig`` holds the calibration of a pair and the IMU samples; ``check`` counts unused images with the
-    reasons; ``received`` counts messages by role.
+    One thread may `add` while another one calls `take` and `decode`.  ``rig`` holds the calibration of a pair
+    and the IMU samples; ``check`` counts unused images with the reasons; ``received`` counts messages by
+    role.
     """
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:

@@ -58,37 +58,31 @@ class BridgeOptions:
         colour: Topic of the colour images: ``Image``, or ``CompressedImage`` if its name ends with
             ``compressed``.
         depth: Topic of the depth images that are registered to the colour images; compressed if its name ends
-            with
-            ``compressedDepth``.  Empty: no depth.
+            with ``compressedDepth``.  Empty: no depth.
         info: Topic of the ``CameraInfo`` of the colour images.
         right: Topic of the right images of a stereo pair, whose left images are the colour images; depth
-            images are
-            not used then.  Empty: no pair.
+            images are not used then.  Empty: no pair.
         right_info: Topic of the ``CameraInfo`` of the right images.
         imu: Topic of an IMU (``sensor_msgs/Imu``), whose pose and noise ``rig`` states; empty: no IMU.
         rig: File of the rig, as ``rse-pf camera calibrate --stereo`` writes it; empty: the calibration of a
-            pair is
-            that of both ``CameraInfo`` topics.
+            pair is that of both ``CameraInfo`` topics.
         depth_scale: Units of a 16-bit depth image in a metre.
         pair_within_s: Largest difference (s) of the time stamps of a colour image and its depth or right
             image.
         queue_frames: Largest number of frames that wait while another is tracked; above it, the oldest frame
-            is
-            dropped and counted.
+            is dropped and counted.
         map_frame: Name of the coordinate frame of the map.
         odom_frame: Name of the odometry frame of this bridge, without the namespace.
         camera_frame: Name of the camera's frame; empty: the name in the messages of the images.
         publish_odom: Whether the transform from odometry frame to camera is published; set it to False if
-            another
-            node publishes a parent of the camera's frame.
+            another node publishes a parent of the camera's frame.
         cloud_every_s: Time between two clouds, in seconds.
         path_poses: Largest number of poses of a path; above it, every second pose is left out.
         out: Folder that the service ``save`` writes to; empty: the service fails.
         publish_as: Name under which the service ``publish`` stores the robot's own map; empty: the service
             fails.
         localise_in: Name of the stored map in which the service ``localise`` finds the pose; empty: the
-            service
-            fails.
+            service fails.
 
     Raises:
         UsageError: A value cannot be used.
@@ -189,7 +183,8 @@ class BridgeOptions:
     def own_odom_frame(self) -> str:
         """The name of the odometry frame with the robot's namespace before it.
 
-        It is put there because ROS adds namespaces to names of topics, but not to names of frames.
+        The namespace is part of the name because ROS adds namespaces to names of topics, but not to names of
+        frames.
         """
         prefix = self.namespace.strip("/")
         return f"{prefix}/{self.odom_frame}" if prefix else self.odom_frame

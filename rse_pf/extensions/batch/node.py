@@ -63,8 +63,8 @@ def security_of(certificate: str, key: str) -> Any:
 def compute(settings: bytes, part: bytes) -> list[str]:
     """Compute a part on a worker and store its result.
 
-    Return an empty list, or code, message and hint of an error.
-    No exception is raised, since Dask would pickle it.
+    Return an empty list, or code, message and hint of an error.  No exception is raised, since Dask would
+    pickle it.
 
     Args:
         settings: The platform's settings as JSON; ``data.store`` is the store of inputs and results.

@@ -1,6 +1,6 @@
 """The page of a deployment on AWS, served on the operator's machine.
 
-It can change nothing in the deployment.
+The page can change nothing in the deployment.
 """
 
 from __future__ import annotations

@@ -71,9 +71,8 @@ def serve_page(
         listening: The listening socket on loopback.
         works: Returns the coroutines that feed the hub; they run while the page is served.
         platform: Folder of a local platform's state.  Who knows its control token may request keys, and pid
-            and port
-            are in a file of the folder while the page is served.  None for a deployment on AWS, which has
-            neither.
+            and port are in a file of the folder while the page is served.  None for a deployment on AWS,
+            which has neither.
         ready: Called with the page's address, which contains the first key.
 
     Raises:

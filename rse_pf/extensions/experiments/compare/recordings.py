@@ -48,9 +48,8 @@ def drives_of(
 ) -> list[Drive]:
     """Return each of the recordings *words* at each of *rates_hz*.
 
-    Without rates, at the recording's own rate.
-    Rates that give the same frames of a recording give one drive.  *camera* and *imu* are those of
-    `open_dataset`.
+    Without rates, at the recording's own rate.  Rates that give the same frames of a recording give one
+    drive.  *camera* and *imu* are those of `open_dataset`.
 
     Raises:
         UsageError: A recording cannot be read, or two recordings have the same name.

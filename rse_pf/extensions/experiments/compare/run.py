@@ -55,10 +55,7 @@ class CompareOptions:
     out: Path = Path("out-compare")
     platform: bool = False
     accepted: tuple[str, ...] = ()
-    """Names of findings about the recordings that the user accepts.
-
-    So they are not shown (``--accept``).
-    """
+    """Names of findings about the recordings that the user accepts (``--accept``); they are not shown."""
 
 
 def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:

@@ -72,10 +72,9 @@ class LiveFault:
         return self.name == "wifi"
 
     def settings(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return *settings* changed for this fault: the map's log is kept completely.
+        """Return *settings* changed for this fault: the log of the map is never shortened.
 
-        So it can be replayed.
-        For "wifi", the time within which a pose must be answered is 0.5 s.
+        The complete log is replayed later.  For "wifi", a pose must be answered within 0.5 s.
         """
         changed = settings.replace(live={"keep_log": True})
         return (

@@ -38,7 +38,7 @@ __all__ = [
 PERIOD_S = 0.04
 """Seconds of one cycle of stopping and continuing a slowed server.
 
-It is long compared with a context switch and short compared with the interval of health checks."""
+A cycle is long compared with a context switch and short compared with the interval of health checks."""
 
 
 def find_server(state: PlatformState, name: str) -> ServerState:
@@ -81,8 +81,8 @@ def tree(root: ProcessMark) -> list[ProcessMark]:
 def signal_tree(root: ProcessMark, number: signal.Signals) -> int:
     """Send signal *number* to *root* and all its descendants.
 
-    Return the number of processes that were signalled.
-    The search is repeated until it finds no further process: one may start another before it is stopped.
+    Return the number of processes that were signalled.  The search is repeated until it finds no further
+    process: one may start another before it is stopped.
     """
     signalled: set[ProcessMark] = set()
     while new := [mark for mark in tree(root) if mark not in signalled]:
@@ -103,9 +103,8 @@ def kill_balancer(state: PlatformState) -> int:
 def slow_down(root: ProcessMark, percent: float, wait: Callable[[float], bool]) -> None:
     """Let *root* and its descendants run only *percent* of the time, until *wait* returns True.
 
-    The call returns earlier if *root* exits.
-    The processes are stopped and continued by signals in cycles of `PERIOD_S`; they run when the call
-    returns.
+    The call returns earlier if *root* exits.  The processes are stopped and continued by signals in cycles of
+    `PERIOD_S`; they run when the call returns.
 
     Args:
         root: The process of a server.

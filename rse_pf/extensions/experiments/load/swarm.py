@@ -114,8 +114,7 @@ class Swarm:
             token_of: Returns a token for a robot; called in this process whenever a robot connects.
             session: Limits and timeouts of the robots.
             on_event: Called with an event for each robot that joins, leaves, loses its connection or
-                migrates; its
-                ``time`` is in seconds since *origin*, as in the records.
+                migrates; its ``time`` is in seconds since *origin*, as in the records.
             origin: The `time.monotonic` from which all records count; None means the time of `start`.
         """
         self.scenario = scenario

@@ -148,7 +148,7 @@ class Harness:
     async def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until *condition* returns True; return False if it did not within *timeout_s*.
 
-        It is called after each event and sample, and at least once a second.
+        *condition* is called after each event and sample, and at least once a second.
         """
         end = time.monotonic() + timeout_s
         while not condition():

@@ -1,8 +1,8 @@
 """The experiment on live maps: robots build one map together while they drive.
 
-It runs the demo with --live (real servers, a real load balancer, a process per robot).  In addition to the
-records of every experiment it stores the poses that each robot reported while it drove, its corrections and
-keyframes, and the published map, so that every figure can be computed again.
+The experiment runs the demo with --live (real servers, a real load balancer, a process per robot).  In
+addition to the records of every experiment it stores the poses that each robot reported while it drove, its
+corrections and keyframes, and the published map, so that every figure can be computed again.
 """
 
 from __future__ import annotations

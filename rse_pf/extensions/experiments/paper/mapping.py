@@ -1,7 +1,7 @@
 """The mapping experiment (the paper's Fig. 7): robots build point clouds, and their errors are measured.
 
-It runs the demo (real servers, a real load balancer, a process per robot) and writes the true trajectories to
-the same folders as the estimated ones, so that the errors can be computed again.
+The experiment runs the demo (real servers, a real load balancer, a process per robot) and writes the true
+trajectories to the same folders as the estimated ones, so that the errors can be computed again.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
 def _bars(figures: Mapping[str, Any]) -> Bars:
     """Return the targets of a short run.
 
-    They are no lost or duplicated command, and the largest number of lost frames and the largest ATE in
-    *figures*.
+    The targets are no lost or duplicated command, and the largest number of lost frames and the largest ATE
+    in *figures*.
     """
     bars = {f"commands/{name}": (0.0, "<=") for name in ("lost", "twice")}
     return {**bars, **{name: (max(figures[name]), "<=") for name in ("lost_frames", "ate_cm")}}

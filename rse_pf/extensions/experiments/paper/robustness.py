@@ -388,8 +388,8 @@ def _adoption(events: Sequence[Event]) -> dict[str, Any]:
 def _measure_cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
     """Return the figures of a cut link, in seconds.
 
-    They are the times until robots and servers noticed the cut, and the times from its end to the first
-    answer of each robot.  ``stale_as_fresh`` counts answers that were delivered after their deadline.
+    The figures are the times until robots and servers noticed the cut, and the times from its end to the
+    first answer of each robot.  ``stale_as_fresh`` counts answers that were delivered after their deadline.
     """
     healed = [float(event["time"]) for event in records.events if event["action"] == "healed"]
     noticed: dict[str, float] = {}

@@ -1,6 +1,7 @@
 """The image of a map (the paper's Fig. 7): a coloured point cloud with the paths of its cameras.
 
-It is drawn with Pillow alone, because Matplotlib and its fonts would be a fifth of what the demo installs.
+The image is drawn with Pillow alone, because Matplotlib and its fonts would be a fifth of what the demo
+installs.
 """
 
 from __future__ import annotations

@@ -182,8 +182,8 @@ def _fault_at_s(events: Sequence[Event], started_s: float) -> float | None:
 def _new_owner_s(events: Sequence[Event]) -> float | None:
     """Return the longest time (s) without a map server; None if the map server never changed.
 
-    It lasts from the fault, or from the release of the lease if the map server released it, until the next
-    map server serves.
+    The time lasts from the fault, or from the release of the lease if the map server released it, until the
+    next map server serves.
     """
     fault = next((entry for entry in events if entry["action"] == "fault" and "owner" in entry), None)
     if fault is None:

@@ -57,8 +57,7 @@ def fresh_folder(folder: Path, written: Sequence[str]) -> Path:
 
     Raises:
         UsageError: *folder* is a file, holds other files, holds no events of a run, or cannot be written.
-            Other
-            files are never removed.
+            Other files are never removed.
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", hint="name a folder with --out")

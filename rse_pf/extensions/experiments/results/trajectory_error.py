@@ -74,8 +74,8 @@ def accuracy(
         with_scale: Align with a scale (Sim(3)), for an estimate whose unit is unknown; otherwise without
             (SE(3)).
         T_body_camera: ``(4, 4)``, metres.  If given, both trajectories are compared as poses of the body.
-            With
-            *with_scale* the camera's path is scaled to metres first, since the body's offset is in metres.
+            With *with_scale* the camera's path is scaled to metres first, since the body's offset is in
+            metres.
 
     Raises:
         UsageError: Fewer than three poses have a truth.
@@ -129,8 +129,8 @@ def match_truth(estimate: Trajectory, truth: Trajectory) -> tuple[npt.NDArray[np
 def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     """Return for each of the times ``(n,)`` whether it has a truth.
 
-    It has one between two true poses at most `MAX_TRUTH_GAP_S` apart, or within `SAME_STAMP_S` of a true
-    pose.
+    A time has a truth between two true poses at most `MAX_TRUTH_GAP_S` apart, or within `SAME_STAMP_S` of a
+    true pose.
     """
     stamps, known = np.asarray(stamps_s, dtype=float), np.sort(truth.timestamps_s)
     if not len(known):

@@ -53,8 +53,7 @@ class AuditRows:
 
         Args:
             is_reported: Returns whether an event of the control plane was reported in another way; such an
-                event is
-                left out.
+                event is left out.
         """
         rows: list[dict[str, Any]] = []
         events: list[dict[str, Any]] = []

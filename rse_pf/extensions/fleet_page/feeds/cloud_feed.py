@@ -1,7 +1,7 @@
 """The feed of the page of a deployment on AWS, which it reads with the operator's credentials.
 
-It reads only while a page is open, changes nothing in the account, and opens no port there.  The page lists
-the data that AWS does not provide.
+The feed reads AWS only while a page is open, changes nothing in the account, and opens no port there.  The
+page lists the data that AWS does not provide.
 """
 
 from __future__ import annotations
@@ -224,8 +224,8 @@ def cloud_document(
 def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: float) -> list[dict[str, Any]]:
     """Return rows of the Events view for the changes between two readings.
 
-    They are scaling activities, alarms, and servers that changed or left.  At the first reading, *before* is
-    None, and the rows are all known activities and the alarms in state ALARM.
+    The changes are scaling activities, alarms, and servers that changed or left.  At the first reading,
+    *before* is None, and the rows are all known activities and the alarms in state ALARM.
     """
     old_activities = (
         set() if before is None else {(activity.id, activity.status) for activity in before.activities}

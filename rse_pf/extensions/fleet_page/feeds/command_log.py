@@ -54,8 +54,8 @@ class CommandLog:
 def _row(line: bytes) -> dict[str, Any] | None:
     """Return the row of the Poses view for a log line.
 
-    None if the line is not about a weak or failed command.
-    Commands with the codes busy and stale are no failures here.
+    None if the line is not about a weak or failed command.  Commands with the codes busy and stale are no
+    failures here.
     """
     if _MARK not in line:
         return None

@@ -1,6 +1,7 @@
 """Sentences that announce what the scale modifier will do next, and when.
 
-They follow the rules of `rse_pf.scaling.policy.decide`; a test compares the sentences with its decisions.
+The sentences follow the rules of `rse_pf.scaling.policy.decide`; a test compares the sentences with its
+decisions.
 """
 
 from __future__ import annotations
@@ -23,8 +24,7 @@ def waiting_for(policy: Mapping[str, Any], settings: ScalingSettings, *, servers
 
     Args:
         policy: The scale modifier's part of the platform's status: ``elastic``, ``samples`` of complete
-            periods, and
-            the smallest and largest number of servers.
+            periods, and the smallest and largest number of servers.
         settings: The group scaling of the platform's settings.
         servers: Number of servers that are starting or serving.
     """
