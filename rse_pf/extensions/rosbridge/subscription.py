@@ -81,7 +81,10 @@ class Subscription:
         self._count(-self._bytes)
 
     def put(self, message: TopicMessage) -> None:
-        """Add *message* to the queue; drop the oldest messages above the limits of length and bytes."""
+        """Add *message* to the queue; drop the oldest messages above 100 messages or 1 MiB.
+
+        While more than 32 MiB wait for the subscriptions of the tenant, only the newest message is stored.
+        """
         self._waiting.append(message)
         self._count(len(message.data))
         self._drop_beyond(MAX_QUEUE_LENGTH if self._held.of_tenant <= MAX_HELD_BYTES else 1)

@@ -40,8 +40,9 @@ SLOTS = ("features", "motion", "loops", "optimiser")
 # Options that a file may set.
 _OPTIONS = ("base", "depth", "frontend", "monocular")
 _FEATURES = re.compile(r"features-(\d{1,6})")
-# Smallest and largest N of ``features-N``.
+# Smallest N of ``features-N``.
 _MIN_FEATURES = 50
+# Largest N of ``features-N``.
 _MAX_FEATURES = 20_000
 # Largest TOML file, in bytes: the time to parse a dotted name grows with the square of its parts.
 _MAX_BYTES = 16 << 10

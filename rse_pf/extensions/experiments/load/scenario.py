@@ -26,11 +26,11 @@ SERVICES = ("pnp", "echo")
 So replies are checked.
 """
 
-_MAX_ROBOTS = 10_000
-_MAX_PROCESSES = 16
-_MAX_FPS = 200.0  # commands per second of each robot
-_MAX_MATCHES = 5000  # matches of a PnP problem, or numbers of an echo
-_MAX_S = 86400.0  # longest load: a day
+_MAX_ROBOTS = 10_000  # largest number of robots of a load
+_MAX_PROCESSES = 16  # largest number of processes that generate a load
+_MAX_FPS = 200.0  # largest number of commands per second of each robot
+_MAX_MATCHES = 5000  # largest number of matches of a PnP problem, or of numbers of an echo
+_MAX_S = 86400.0  # longest load, in seconds: a day
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -40,6 +40,7 @@ __all__ = ["run_control_plane_fault"]
 
 # Name of the local platform.
 _NAME = "experiment"
+# Number of servers of the platform.
 _SERVERS = 2
 # Seconds under load before the control plane is killed.
 _LEAD_S = 4.0

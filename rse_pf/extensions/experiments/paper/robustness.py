@@ -177,7 +177,9 @@ def _line(name: str, run: Mapping[str, Any]) -> str:
     )
 
 
+# Targets of every scenario.
 _NO_LOSS = {"commands/lost": (0, "<="), "commands/twice": (0, "<=")}
+# Targets of scenarios during which no command may fail either.
 _NO_FAILURE = {**_NO_LOSS, "commands/failed": (0, "<=")}
 
 BARS: dict[str, dict[str, tuple[float, str]]] = {
@@ -335,7 +337,7 @@ def _scenario_figures(scenario: str, records: Records, faults: Sequence[Event]) 
 
 
 def _outages(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
-    """Return how many robots *faults* affected, and percentiles of each one's longest outage (s).
+    """Return how many robots *faults* affected, and p50, p99 and maximum of their longest outages (s).
 
     A fault of a server affects the robots connected to that server, every other fault affects all robots.
     """

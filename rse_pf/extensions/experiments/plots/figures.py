@@ -35,7 +35,7 @@ _BINS = 80
 # Upper limit of the CPU axis: a server with emulated cores limits the requests that it starts, not the CPU
 # time that they use, so that peaks exceed 100 %.
 _MAX_PERCENT = 170.0
-_DPI = 130
+_DPI = 130  # resolution of the PNG files, in dots per inch
 
 
 def require_matplotlib() -> None:

@@ -40,8 +40,11 @@ __all__ = [
 ]
 
 COMMANDS = "commands.csv"
+"""Name of the file with the commands of a run."""
 EVENTS = "events.jsonl"
+"""Name of the file with the events of a run."""
 SAMPLES = "samples.csv"
+"""Name of the file with the samples of the monitor during a run."""
 # Exceptions that a missing or malformed file of records raises.
 _MALFORMED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _HINT = "name the folder of a run"

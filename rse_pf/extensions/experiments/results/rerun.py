@@ -21,6 +21,7 @@ RERUN = "rerun"
 """Member of a report that holds the plan."""
 # Tolerance: a "<=" target is multiplied by this factor for a short run, a ">=" target divided by it.
 _SLACK = 1.5
+# A target in a report, such as "<= 1.5".
 _BAR = re.compile(r"(<=|>=) (-?\d+(\.\d+)?(e[-+]?\d+)?)")
 
 

@@ -37,7 +37,7 @@ _GROUP_SERIES = {
     "p99_ms": (NAMESPACE, "AnswerMs", "p99"),
     "answers": (NAMESPACE, "AnswerMs", "SampleCount"),
 }
-# Metrics of each server, in the same form.
+# Metrics of each server by our name: namespace, name and statistic in CloudWatch.
 _SERVER_SERIES = {
     "cpu_percent": (_EC2, "CPUUtilization", "Average"),
     "robots": (NAMESPACE, ROBOTS, "Maximum"),

@@ -79,6 +79,7 @@ class _Missing(dict[str, str]):
         return "-"
 
 
+# The sentence for each kind of event; names in braces are members of the event.
 EVENTS: Mapping[str, str] = {
     "adopted": "servers of an earlier control plane were adopted: {servers}",
     "balancer-back": "the load balancer is back after {seconds} s",

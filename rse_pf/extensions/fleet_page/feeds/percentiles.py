@@ -15,7 +15,7 @@ from typing import Any
 
 __all__ = ["LastMinute", "buckets_of", "percentile"]
 
-_MINUTE_S = 60.0
+_MINUTE_S = 60.0  # time over which percentiles are computed, in seconds
 _BUCKET = re.compile(r"rse_pf_duration_seconds_bucket\{([^}]*)\} ([0-9.eE+]+)")
 _BOUND = re.compile(r'le="([^"]+)"')
 
