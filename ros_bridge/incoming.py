@@ -123,7 +123,7 @@ class PairedImages:
 class IncomingFrames:
     """Pairs the images of two topics into frames.
 
-    One thread may `add` while another one calls `take` and `decode`.  ``rig`` holds the calibration of a pair
+    Any thread may `add`; one other thread calls `take` and `decode`.  ``rig`` holds the calibration of a pair
     and the IMU samples; ``check`` counts unused images with the reasons; ``received`` counts messages by
     role.
     """

@@ -165,7 +165,7 @@ async def _drain_busiest(harness: Harness, watch_s: float, *, grow_first: bool =
 
 
 async def _wait_replaced(harness: Harness, began: float) -> None:
-    """Wait until a server that was launched after *began* is healthy."""
+    """Wait until a server that was launched after *began* is healthy, for at most 30 s."""
 
     def replaced() -> bool:
         new = {event["server"] for event in harness.events_since("server-launched", began)}
