@@ -52,7 +52,7 @@ _UP_TO_SCALE = "up to scale"
 # Printed if no robot has a metric scale.
 _NO_METRES = (
     "no robot has metres, so that no robot could be aligned with the map: each has one camera without depth\n"
-    "  hint: give one robot depth, a stereo pair or an IMU: --camera stereo, --imu\n"
+    "  hint: let one of them have depth, a stereo pair or an IMU: --camera stereo, --imu\n"
 )
 
 
