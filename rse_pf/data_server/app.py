@@ -54,15 +54,16 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["DataServer"]
 
+# The claims of a request for a route without a scope, whose token is not read.
 _ANONYMOUS = Claims(robot=RobotId("", ""), token_id="", issued_s=0.0, expires_s=0.0, key_id="")
-_PROBES = ("/data/healthz", "/data/readyz")
-_RETRY_AFTER_MS = 1000.0  # while the server has no keys: they are read again within this time
-_REQUEST_TIMEOUT = 408
-_REFUSAL_PAUSE_S = 0.25  # delay of a refusal, so that a robot that ignores it does not overload the server
+_PROBES = ("/data/healthz", "/data/readyz")  # paths of health checks, whose requests are not logged
+_RETRY_AFTER_MS = 1000.0  # Retry-After while the server has no keys: the key file is read every 0.5 s
+_REQUEST_TIMEOUT = 408  # HTTP status of a body that came too slowly
+_REFUSAL_PAUSE_S = 0.25  # delay of a rate-limit refusal: each connection gets at most four of them a second
 
 
 class DataServer:
-    """The application; call it with ``(scope, receive, send)``."""
+    """The data service as an ASGI application: call it with ``(scope, receive, send)`` for each request."""
 
     def __init__(
         self,
@@ -88,10 +89,10 @@ class DataServer:
             clock: Monotonic seconds.
             wall_clock: Unix seconds.
             audit: Records refused tokens and changes of maps; None records nothing.
-            describe: Returns what the map in an object that a robot sent holds; None starts a process with
-                limits for it.
-            localiser: Localises photos; None starts processes with limits for it.
-            pause: Waits, for a time in seconds, before the refusal of a robot above its limits is sent.
+            describe: Returns the summary of the map in a robot's object, given the robot and the object's
+                name; None computes the summary in a process with limits on memory and CPU time.
+            localiser: Localises photos; None localises them in processes with limits on memory and CPU time.
+            pause: Waits for a time in seconds; called before the refusal of a robot above its limits is sent.
         """
         self._audit = audit
         self._refusals = RefusalLimiter()
@@ -124,9 +125,10 @@ class DataServer:
             self._routes.setdefault(route.method, []).append((route.pattern, route, handler))
 
     async def __call__(self, scope: Mapping[str, Any], receive: Receive, send: Send) -> None:
-        """Handle one request; raises BadRequest for another protocol.
+        """Reply to one HTTP request and log it; raise BadRequest if *scope* is not one of HTTP.
 
-        Cancelled when the robot closes the connection: work for it ends, and there is no reply.
+        The server cancels this call when the robot closes the connection: then the work for the request
+        stops, and no reply is sent.
         """
         if scope["type"] != "http":
             raise BadRequest(f"{scope['type']} is not supported", hint="use HTTP")
@@ -139,7 +141,7 @@ class DataServer:
             line |= {"status": reply.status, "sent_bytes": sent}
         except Disconnected:
             line["status"] = "disconnected"
-        except asyncio.CancelledError:  # nobody waits for the reply
+        except asyncio.CancelledError:  # the robot closed the connection and waits for no reply
             line["status"] = "disconnected"
             raise
         finally:
@@ -164,8 +166,8 @@ class DataServer:
             trace = uuid.uuid4().hex
             line |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"search its log for {trace}"))
-        # After a small body that has arrived the connection stays open; otherwise it is closed after the
-        # reply.
+        # A reply may be ready before the body was read.  If the rest of the body arrives within 0.1 s, the
+        # connection stays open for the next request; otherwise it is closed after the reply.
         if not request.is_complete and (
             reply.status == _REQUEST_TIMEOUT or not await request.drain_soon(self._settings.data.part_bytes)
         ):
@@ -185,7 +187,9 @@ class DataServer:
         try:
             self._limits.begin(request, claims.robot, route.cost, self._clock(), has_body=has_body)
         except Busy:
-            await self._pause(_REFUSAL_PAUSE_S)  # its connections send no further request before this
+            await self._pause(
+                _REFUSAL_PAUSE_S
+            )  # the connection cannot send its next request before the reply
             raise
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest(
@@ -206,7 +210,7 @@ class DataServer:
         raise MethodNotAllowed(", ".join(self._methods(request.path)))
 
     def _methods(self, path: str) -> list[str]:
-        """Return the methods of *path*; raises NotFound if it has none."""
+        """Return the HTTP methods of all routes that match *path*; raises NotFound if no route does."""
         methods = [route.method for route in ROUTES if route.pattern.fullmatch(path)]
         if not methods:
             raise NotFound("no such path", hint="see /data/openapi.json")
@@ -241,26 +245,29 @@ class DataServer:
         self._limits.charge_cpu(robot, cpu_s, PHOTO_COST, self._clock())
 
     def close(self) -> None:
-        """End what the application started, when its work is done."""
+        """Stop the processes that read maps, then wait until the handlers' threads have finished."""
         self._closing.close()
         self.handlers.close()
 
     def record_counted(self) -> None:
-        """Record how many refusals were counted, but not recorded one by one, since the last call."""
+        """Write the number of refused tokens that were not audited one by one since the last call, by reason.
+
+        Nothing is written if there were none, or if there is no audit log.
+        """
         counted = self._refusals.summary()
         if self._audit is not None and counted:
             self._audit.record("auth.refused-many", **counted)
 
 
 async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
-    """Send *reply*; return how many bytes of body were sent."""
+    """Send *reply* to the client; return how many bytes of its body were sent."""
     body = reply.body
     headers = {"Content-Type": reply.media_type, "Cache-Control": "no-store", **reply.headers}
     if isinstance(body, bytes) and reply.status not in (204, 304):
         headers.setdefault("Content-Length", str(len(body)))
     raw = [(name.lower().encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]
     await send({"type": "http.response.start", "status": reply.status, "headers": raw})
-    is_open = not request.is_complete  # then the reply is complete for the robot before the request is
+    is_open = not request.is_complete  # the robot still sends its body while this reply is sent
     sent, body = 0, b"" if request.method == "HEAD" else body
     if isinstance(body, bytes):
         sent = len(body)
@@ -269,10 +276,10 @@ async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
         size = int(headers["Content-Length"])
         async for piece in body:
             sent += len(piece)
-            # A client that has the last byte may send its next request at once.
+            # A client that has the last byte may send its next request at once, so no empty piece follows it.
             await send({"type": "http.response.body", "body": piece, "more_body": is_open or sent < size})
-            await asyncio.sleep(0)  # serve other requests in between, also if sending never waits
-    if is_open:  # the connection ends after it
+            await asyncio.sleep(0)  # other requests are served between two pieces, also if `send` never waits
+    if is_open:  # the connection is closed after this reply
         if reply.status != _REQUEST_TIMEOUT:
             await request.discard()
         await send({"type": "http.response.body", "body": b"", "more_body": False})

@@ -1,8 +1,8 @@
 """A thread pool that is fair between tenants and robots, so that slow work of one robot delays no other.
 
-Work starts in the order of `FairQueue`, and a robot has at most one thread.  The last free thread of several
-goes to a tenant that has none, so that two tenants with slow work do not delay a third.  Work whose robot has
-disconnected is not started; running work ends at its next call of `check_wanted`.
+Work starts in the order of `FairQueue`, and a robot has at most one thread.  The last free thread is given
+only to a tenant for which no thread works, so that two tenants with slow work do not delay a third.
+Work whose robot has disconnected is not started; running work stops at its next call of `check_wanted`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from rse_pf.limits.fair_queue import FairQueue
 __all__ = ["FairThreads", "check_wanted", "while_wanted"]
 
 _T = TypeVar("_T")
-_THREADS = 8  # they mostly wait for the store
-_MAX_PER_TENANT = 6  # threads of one tenant: two of eight are left for the others
+_THREADS = 8  # more than the cores of a machine, because these threads mostly wait for the store
+_MAX_PER_TENANT = 6  # threads that may work for one tenant: two of the eight stay free for other tenants
 
 
 @dataclass(slots=True, eq=False)
@@ -36,45 +36,49 @@ class _Task:
     is_wanted: bool = True
 
 
-class _OfThread(threading.local):
+class _WorkOfThread(threading.local):
     task: _Task | None = None
 
 
-_current = _OfThread()
+_current = _WorkOfThread()
 
 
 def check_wanted() -> None:
-    """Raise Disconnected if this thread works on a request whose robot has disconnected."""
+    """Raise Disconnected if this thread works on a request whose robot has disconnected.
+
+    In a thread that does not belong to a `FairThreads`, do nothing.
+    """
     task = _current.task
     if task is not None and not task.is_wanted:
         raise Disconnected("the robot closed the connection before the reply")
 
 
 def while_wanted(items: Iterable[_T]) -> Iterator[_T]:
-    """Yield *items* for as long as the robot waits for them; raises Disconnected."""
+    """Yield *items*; call `check_wanted` before each, which raises Disconnected once the robot has left."""
     for item in items:
         check_wanted()
         yield item
 
 
 class FairThreads:
-    """A pool of threads, started when they are needed, for the work of robots in the order of `FairQueue`.
-
-    `close` waits for running work and drops the rest.
-    """
+    """At most *threads* threads, started when needed, for the work of robots in the order of `FairQueue`."""
 
     def __init__(self, threads: int = _THREADS) -> None:
-        self._most = threads
+        self._max_threads = threads
         self._threads: list[threading.Thread] = []
         self._started: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._free = threads
-        self._lock = threading.Lock()  # held for some microseconds, never during work
+        self._lock = threading.Lock()  # guards the queue and the counts; never held while a function runs
         self._queue: FairQueue[_Task] = FairQueue(
             max_running_per_robot=1, max_running_per_tenant=_MAX_PER_TENANT
         )
 
     async def run(self, robot: RobotId, function: Callable[..., _T], *arguments: Any) -> _T:
-        """Return ``function(*arguments)``, computed in a thread when the robot is next."""
+        """Return ``function(*arguments)``, computed in a thread when the queue has reached *robot*.
+
+        Raises what *function* raises.  If this call is cancelled, waiting work is dropped, and running work
+        stops at its next call of `check_wanted`.
+        """
         loop = asyncio.get_running_loop()
         task = _Task(robot, function, arguments, loop, loop.create_future())
         with self._lock:
@@ -88,7 +92,7 @@ class FairThreads:
         return result
 
     def close(self) -> None:
-        """Wait for the work that runs, and start no more."""
+        """Drop the waiting work, whose calls of `run` then never return, and wait for the running work."""
         with self._lock:
             self._free = 0
             self._queue.remove(lambda task: True)
@@ -98,9 +102,9 @@ class FairThreads:
             thread.join()
 
     def _start(self) -> None:
-        """Start what may run now; the lock is held."""
+        """Give waiting tasks to free threads, as far as the limits allow; the caller holds the lock."""
         while self._free > 0:
-            task = self._queue.take(only_newcomers=self._free == 1 < self._most)
+            task = self._queue.take(only_newcomers=self._free == 1 < self._max_threads)
             if task is None:
                 return
             if not task.is_wanted:
@@ -108,7 +112,7 @@ class FairThreads:
                 continue
             self._free -= 1
             self._started.put(task)
-            if len(self._threads) < min(self._most, self._most - self._free):
+            if len(self._threads) < min(self._max_threads, self._max_threads - self._free):
                 thread = threading.Thread(target=self._work_on, name="data", daemon=True)
                 self._threads.append(thread)
                 thread.start()
@@ -122,10 +126,10 @@ class FairThreads:
         result, problem = None, None
         try:
             result = task.function(*task.arguments)
-        except BaseException as error:  # noqa: BLE001 - it belongs to the one who waits
+        except BaseException as error:  # noqa: BLE001 - `run` raises it to its caller
             problem = error
         self._end(task)
-        with contextlib.suppress(RuntimeError):  # the loop was closed: nobody waits
+        with contextlib.suppress(RuntimeError):  # the event loop was closed: no call of `run` waits any more
             task.loop.call_soon_threadsafe(_settle, task.future, result, problem)
 
     def _end(self, task: _Task) -> None:
@@ -137,7 +141,7 @@ class FairThreads:
 
 def _settle(future: asyncio.Future[Any], result: Any, problem: BaseException | None) -> None:
     if future.done():
-        return  # it was cancelled
+        return  # the call of `run` was cancelled
     if problem is None:
         future.set_result(result)
     else:

@@ -1,7 +1,7 @@
-"""HTTP requests and replies as values; a body has limits on its size, its pauses and its rate.
+"""HTTP requests and replies as values; a request body has limits on its size, its pauses and its rate.
 
-An error is sent as a status, a code, a message and a hint, never as a traceback.  No more of a body than its
-limit is held in memory.
+An error is sent as a status, a code, a message and a hint, never as a traceback.  Of a body that is longer
+than its limit nothing is kept in memory.
 """
 
 from __future__ import annotations
@@ -60,17 +60,17 @@ __all__ = [
 _T = TypeVar("_T")
 Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
-_MIN_BODY_BYTES_PER_S = 1024  # a slower body is refused, even if no other body waits for its place
-_BODY_GRACE_S = 5.0  # a body may be slower for this time: a robot in motion may lose its network for as long
-_LEAST_TIME_S = 0.1  # shortest time over which the rate of a body is computed
-_IN_PARTS = "send the object in parts: PUT an upload"
-_DRAIN_S = 0.1  # for reading the rest of a body before a refusal is sent, so that the connection stays open
-_DISCARD_S = 2.0  # for reading the rest of a body after a refusal was sent, before the connection is closed
-_MAX_DROPPED_BYTES = 32 << 20  # of a body that is too long and read to its end; a photo of a phone is shorter
+_MIN_BODY_BYTES_PER_S = 1024  # least average rate of a request body; a slower body is refused with 408
+_BODY_GRACE_S = 5.0  # the average rate is checked only after this time: a moving robot may lose its network
+_MIN_RATE_TIME_S = 0.1  # shortest time over which the rate of a body is computed, so that it stays finite
+_PARTS_HINT = "send the object in parts: PUT an upload"
+_DRAIN_S = 0.1  # time to read the rest of a body before a refusal is sent, so that the connection stays open
+_DISCARD_S = 2.0  # time to read the rest of a body after a refusal was sent, before the connection is closed
+_MAX_DROPPED_BYTES = 32 << 20  # longest body that is read and dropped when it is above its limit
 
 
 class MethodNotAllowed(BadRequest):
-    """The path has other methods than this one; *allowed* lists them."""
+    """The path has no such HTTP method; *allowed* lists its methods, separated by commas (status 405)."""
 
     def __init__(self, allowed: str) -> None:
         super().__init__("the path does not support this method", hint=f"use {allowed}")
@@ -78,28 +78,29 @@ class MethodNotAllowed(BadRequest):
 
 
 class PreconditionFailed(Conflict):
-    """A condition of the request's header does not hold: nothing was read or changed."""
+    """``If-Match`` or ``If-None-Match`` does not hold, so nothing was read or changed (status 412)."""
 
 
 class TooManyRequests(Busy):
-    """This robot sends more requests than its limit allows; other robots are not affected."""
+    """This robot sends more requests than its rate limit allows (status 429); other robots are served."""
 
 
+# HTTP status of the reply to an error; a class without an entry has that of its base class, or 500.
 _STATUS: dict[type[RsePfError], int] = {
     MethodNotAllowed: 405, PreconditionFailed: 412, TooManyRequests: 429,
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
     QuotaExceeded: 413, Crashed: 413, BadRequest: 400, InvalidCamera: 400, Busy: 503, WorkerLost: 503,
     Archived: 409, StoreFull: 507, StoreError: 503, MissingExtra: 501,
 }  # fmt: skip
-_FRAMES = {"content-length", "transfer-encoding"}
-"""A request with none of these headers has no body."""
-_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.IGNORECASE)
-_TAG_LISTS = frozenset({"if-match", "if-none-match"})
+_BODY_HEADERS = {"content-length", "transfer-encoding"}
+"""The headers that announce a body: a request with none of them has no body."""
+_BYTE_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.IGNORECASE)
+_TAG_LISTS = frozenset({"if-match", "if-none-match"})  # headers that hold a list of entity tags
 _ENTITY_TAG = re.compile(r'(W/)?"([^"]*)"')
 
 
 class HttpFailure(msgspec.Struct, frozen=True, kw_only=True):
-    """An error: a stable code, a message, and what to do."""
+    """The body of a reply that reports an error: a stable code, a message, and what to do (*hint*)."""
 
     code: str
     message: str
@@ -108,7 +109,11 @@ class HttpFailure(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HttpReply:
-    """A reply; *body* is bytes, or pieces that are read while they are sent."""
+    """A reply to a request.
+
+    *body* is bytes, or an iterator whose pieces are read while they are sent; then *headers* must hold
+    ``Content-Length``.
+    """
 
     status: int
     body: bytes | AsyncIterator[bytes] = b""
@@ -117,7 +122,7 @@ class HttpReply:
 
 
 class HttpRequest:
-    """One request whose body has not been read yet."""
+    """One HTTP request: its head, and methods that read or drop its body."""
 
     def __init__(self, scope: Mapping[str, Any], receive: Receive, clock: Callable[[], float]) -> None:
         self.method = str(scope["method"])
@@ -126,14 +131,14 @@ class HttpRequest:
         self.headers: dict[str, str] = {}
         for raw_name, raw_value in scope["headers"]:
             name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
-            # A list may come in several lines (RFC 9110, Sect. 5.3).
+            # A list of entity tags may come in several headers, which are joined (RFC 9110, Sect. 5.3).
             is_continued = name in _TAG_LISTS and name in self.headers
             self.headers[name] = f"{self.headers[name]}, {value}" if is_continued else value
         query = scope["query_string"]
         self.query = dict(parse_qsl(query.decode("latin-1"), keep_blank_values=True)) if query else {}
         self.received_bytes = 0
-        self.is_complete = not self.headers.keys() & _FRAMES
-        """Whether the whole request was read, or its connection was closed."""
+        self.is_complete = not self.headers.keys() & _BODY_HEADERS
+        """Whether the whole body was read, there is none, or the client closed the connection."""
         self._reader: asyncio.Task[Any] | None = None
         self._began_s = clock()
         self._refusal: RsePfError | None = None
@@ -141,7 +146,11 @@ class HttpRequest:
         self._clock = clock
 
     def header_number(self, name: str) -> int | None:
-        """Return a header that is a whole number; None if it is missing; raises BadRequest."""
+        """Return the number in the header *name*, None if the header is missing.
+
+        Raises:
+            BadRequest: The header is not a whole number of at most 18 decimal digits.
+        """
         text = self.headers.get(name.lower())
         if text is None:
             return None
@@ -149,17 +158,18 @@ class HttpRequest:
             raise BadRequest(f"{name}: {text[:40]!r} is not a number of bytes", hint="send decimal digits")
         return int(text)
 
-    async def body(self, max_bytes: int, *, hint: str = _IN_PARTS) -> bytes:
-        """Return the whole body; *hint* says what to do if it is too long.
+    async def body(self, max_bytes: int, *, hint: str = _PARTS_HINT) -> bytes:
+        """Read and return the whole body; *hint* is the error's hint if the body is too long.
 
-        Most clients read the reply only after they have sent the whole body, and lose it if the connection
-        is reset before.  A body that is too long is therefore read to its end, up to `_MAX_DROPPED_BYTES`.
+        Most clients read the reply only after they have sent the whole body, and lose the reply if the
+        connection is reset before.  A body that is too long is therefore read to its end and dropped, up to
+        `_MAX_DROPPED_BYTES`.
 
         Raises:
-            LimitExceeded: It is longer than *max_bytes*.
-            Expired: It pauses for `BODY_TIMEOUT_S` or stays below `_MIN_BODY_BYTES_PER_S`.
-            Disconnected: The robot closed the connection before the end.
-            RsePfError: The refusal of `end_body`.
+            LimitExceeded: The body is longer than *max_bytes*.
+            Expired: No data came for `BODY_TIMEOUT_S`, or the average rate is below `_MIN_BODY_BYTES_PER_S`.
+            Disconnected: The robot closed the connection before the end of the body.
+            RsePfError: The error that `end_body` was called with meanwhile.
         """
         announced = self.header_number("content-length") or 0
         is_sent = "expect" not in self.headers  # else the client waits for "100 Continue" before the body
@@ -174,10 +184,10 @@ class HttpRequest:
                     pieces.clear()
                 if self.received_bytes > _MAX_DROPPED_BYTES:
                     break
-                if self._refusal is not None:  # wait_for of Python 3.10 may lose a cancellation
+                if self._refusal is not None:  # `wait_for` of Python 3.10 may lose the cancel of `end_body`
                     raise self._refusal
         except asyncio.CancelledError:
-            if self._refusal is None:  # the client has disconnected
+            if self._refusal is None:  # the server cancelled the request: the client has disconnected
                 raise
             raise self._refusal from None
         finally:
@@ -188,32 +198,32 @@ class HttpRequest:
 
     @property
     def is_receiving(self) -> bool:
-        """Whether `body` waits for the rest of a body."""
+        """Whether a call of `body` is running and has not received the whole body yet."""
         return self._reader is not None and not self.is_complete
 
     def received_bytes_per_s(self, now: float) -> float:
-        """Return how fast the body has come until *now*."""
-        return self.received_bytes / max(now - self._began_s, _LEAST_TIME_S)
+        """Return the average rate of the body from the arrival of the request until *now* (s, monotonic)."""
+        return self.received_bytes / max(now - self._began_s, _MIN_RATE_TIME_S)
 
     def end_body(self, refusal: RsePfError) -> None:
-        """Let `body`, which is receiving, raise *refusal*."""
+        """Stop the running call of `body`, which then raises *refusal*; call only while `is_receiving`."""
         assert self._reader is not None
         self._refusal = refusal
         self._reader.cancel()
 
     async def drain_soon(self, max_bytes: int) -> bool:
-        """Call `drain` for at most `_DRAIN_S`, for a body whose rest is already on its way."""
+        """Call `drain` for at most `_DRAIN_S` seconds; return whether the whole body was read."""
         try:
             return await _within(_DRAIN_S, self.drain(max_bytes))
         except asyncio.TimeoutError:
             return False
 
     async def discard(self) -> None:
-        """Read and drop the rest of a body after the reply was sent, at most `_MAX_DROPPED_BYTES` in
-        `_DISCARD_S`.
+        """Read and drop the rest of the body after the reply was sent, before the connection is closed.
 
-        Closing the connection instead would reset it, and the reply would be lost.  A client that waits for
-        "100 Continue" sends no body.
+        At most `_MAX_DROPPED_BYTES` are read, for at most `_DISCARD_S`.  Closing the connection without this
+        would reset it, and the client would lose the reply.  Nothing is read from a client that waits for
+        "100 Continue", because it sends no body.
         """
         if "expect" in self.headers and not self.received_bytes:
             return
@@ -229,7 +239,10 @@ class HttpRequest:
             remaining -= len(message.get("body", b""))
 
     async def drain(self, max_bytes: int) -> bool:
-        """Read and discard the rest, so that the robot reads the reply; return whether all was read."""
+        """Read and drop the rest of the body, so that the robot reads the reply; return whether all was read.
+
+        False if the body is longer than *max_bytes* or came too slowly; raises Disconnected.
+        """
         try:
             if (self.header_number("content-length") or 0) > max_bytes:
                 return False
@@ -262,12 +275,15 @@ class HttpRequest:
 
 
 def json_reply(status: int, value: Any, headers: Mapping[str, str] | None = None) -> HttpReply:
-    """Return a reply whose body is *value* as JSON."""
+    """Return a reply with *status* and *headers* whose body is *value* as JSON."""
     return HttpReply(status=status, body=msgspec.json.encode(value), headers=headers or {})
 
 
 def failure_reply(error: RsePfError) -> HttpReply:
-    """Return the reply that reports *error*."""
+    """Return the reply that reports *error*: its HTTP status, 500 for other errors, and a `HttpFailure`.
+
+    The header Retry-After is the error's time rounded up to whole seconds, at least 1.
+    """
     status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), 500)
     headers: dict[str, str] = {}
     if isinstance(error, MethodNotAllowed):
@@ -280,12 +296,12 @@ def failure_reply(error: RsePfError) -> HttpReply:
 
 
 def has_conditions(request: HttpRequest) -> bool:
-    """Return whether *request* is conditional, apart from a condition for its range."""
+    """Return whether *request* has the header ``If-Match`` or ``If-None-Match``."""
     return not _TAG_LISTS.isdisjoint(request.headers)
 
 
 def check_preconditions(request: HttpRequest, tag: str | None) -> bool:
-    """Return whether *request* is to be carried out; False: it reads what the client has, answer 304.
+    """Return whether to carry *request* out; False means that the client has the object: reply 304.
 
     Args:
         request: With ``If-Match`` or ``If-None-Match``, or without both.
@@ -295,7 +311,7 @@ def check_preconditions(request: HttpRequest, tag: str | None) -> bool:
         PreconditionFailed: The object is not in the state that the client expects.
 
     Source:
-        RFC 9110, Sect. 13.2.2. There is no date of an object, so that conditions by date are ignored.
+        RFC 9110, Sect. 13.2.2.  Objects have no date, so conditions by date are ignored.
     """
     expected, unwanted = (request.headers.get(name) for name in ("if-match", "if-none-match"))
     if expected is not None and not _names_tag(expected, tag, is_weak_enough=False):
@@ -314,17 +330,21 @@ def check_preconditions(request: HttpRequest, tag: str | None) -> bool:
 
 
 def wants_range(request: HttpRequest, tag: str) -> bool:
-    """Return whether a ``Range`` is to be obeyed: without ``If-Range``, or with *tag* in it.
+    """Return whether the header ``Range`` counts: there is no ``If-Range``, or it holds the entity tag *tag*.
 
     Source:
-        RFC 9110, Sect. 13.1.5: strong comparison; a date never holds, since objects have none.
+        RFC 9110, Sect. 13.1.5: strong comparison.  A date in ``If-Range`` never matches, because objects have
+        no date.
     """
     condition = request.headers.get("if-range")
     return condition is None or condition.strip() == f'"{tag}"'
 
 
 def _names_tag(text: str, tag: str | None, *, is_weak_enough: bool) -> bool:
-    """Return whether a list of entity tags, or ``*``, names *tag*; weak tags count if *is_weak_enough*."""
+    """Return whether the header value *text*, a list of entity tags or ``*``, names *tag*.
+
+    Weak tags (``W/"..."``) match only if *is_weak_enough*.  *tag* None means that there is no object: False.
+    """
     if tag is None or text.strip() == "*":
         return tag is not None
     return any(named == tag and (is_weak_enough or not weak) for weak, named in _ENTITY_TAG.findall(text))
@@ -335,14 +355,17 @@ def _shown(tag: str | None) -> str:
 
 
 def requested_range(text: str | None, size: int) -> tuple[int, int] | None:
-    """Return ``(start, end)`` of one byte range, end excluded; None for the whole object.
+    """Return ``(start, end)`` of the bytes that the header ``Range`` names, end excluded; None for all bytes.
 
-    A header that is not one single range is ignored, as RFC 9110 Sect. 14.2 allows.
+    Args:
+        text: The header, None if there is none.  A header that is not one single byte range is ignored, as
+            RFC 9110 Sect. 14.2 allows.
+        size: Length of the object in bytes.
 
     Raises:
-        BadRequest: The range lies outside the object; the status is 416.
+        BadRequest: The range lies outside the object; the caller replies 416.
     """
-    match = _RANGE.fullmatch(text.strip()) if text else None
+    match = _BYTE_RANGE.fullmatch(text.strip()) if text else None
     if match is None or match[1] == match[2] == "":
         return None
     if match[1] == "":
@@ -358,15 +381,15 @@ def requested_range(text: str | None, size: int) -> tuple[int, int] | None:
 
 
 async def _within(seconds: float, work: Awaitable[_T]) -> _T:
-    """Return what *work* returns; raises asyncio.TimeoutError after *seconds*."""
-    if sys.version_info >= (3, 11):  # which needs no task of its own for it
+    """Return the result of *work*; cancel it and raise asyncio.TimeoutError after *seconds*."""
+    if sys.version_info >= (3, 11):  # `asyncio.timeout` starts no task, as `wait_for` of Python 3.10 does
         async with asyncio.timeout(seconds):
             return await work
     return await asyncio.wait_for(work, seconds)
 
 
 def _too_long(got: int, max_bytes: int, hint: str) -> LimitExceeded:
-    return LimitExceeded(f"got {got} bytes, the limit is {max_bytes}", hint=hint)
+    return LimitExceeded(f"the body has {got} bytes, the limit is {max_bytes}", hint=hint)
 
 
 def _too_slow(subject: str) -> Expired:

@@ -1,6 +1,7 @@
-"""Count what a committed map holds, in a process that has limits and may be killed.
+"""Summarise a map that a robot commits, in a process with limits on memory and CPU time.
 
-The process reads the object itself, so that the data server never holds a map.
+The process reads the object from the store itself, so that the data server holds no map in memory; only an
+object of a store in the data server's memory is sent to it.
 """
 
 from __future__ import annotations
@@ -17,21 +18,22 @@ from rse_pf.processes.limited import Handler
 
 __all__ = ["TARGET", "MapDescriber", "make_handler"]
 
-TARGET = f"{__name__}:make_handler"
+TARGET = f"{__name__}:make_handler"  # function that a new process calls to get its handler
 
 
 class MapDescriber:
-    """Reads maps in *processes*, which have the target `TARGET`."""
+    """Summarises maps in *processes*, which must have been made with `TARGET`."""
 
     def __init__(self, processes: RobotProcesses) -> None:
         self._processes = processes
 
     def describe(self, robot: RobotId, name: str) -> MapSummary:
-        """Return what the map in the object *name*, which *robot* sent, holds; blocks.
+        """Return the summary of the map in the object *name* of *robot*; block until it is computed.
 
         Raises:
-            BadRequest, LimitExceeded: It is no map, or larger than maps may be.
-            Crashed, Busy, Expired, WorkerLost: As `RobotProcesses.call` says.
+            BadRequest: The object is not a map.
+            LimitExceeded: The map is larger than the limits allow.
+            Crashed, Busy, Expired, WorkerLost: See `RobotProcesses.call`.
         """
         store = self._processes.private_store
         data = None if store is None else store.get(name)
@@ -39,12 +41,15 @@ class MapDescriber:
         return msgspec.msgpack.decode(reply, type=MapSummary)
 
     def close(self) -> None:
-        """End the process; a call that is under way raises WorkerLost."""
+        """Kill the process; a running call of `describe` raises WorkerLost."""
         self._processes.close()
 
 
 def make_handler(configuration: str) -> Handler:
-    """Return what answers in the process; *configuration* has the settings in JSON."""
+    """Return the function that answers `MapDescriber.describe` in the process.
+
+    *configuration* is the platform's settings as JSON.
+    """
     settings = PlatformSettings.from_dict(json.loads(configuration))
     store = shared_store(settings)
 

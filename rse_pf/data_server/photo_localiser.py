@@ -1,7 +1,7 @@
-"""Find where photos were taken in maps, in processes that have limits and may be killed.
+"""Find the poses of photos in maps, in processes with limits on memory and CPU time.
 
-A process reads maps itself and keeps the last ones, so that the data server never holds a map nor decodes an
-image.
+A process reads maps from the store itself and caches the last `_CACHED_MAPS`, so that the data server neither
+keeps maps nor decodes images.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 __all__ = ["PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
 
-TARGET = f"{__name__}:make_handler"
-PROCESSES = 3  # a robot has at most one, and the last is left to a tenant that has none (`FairThreads`)
-_CACHED_MAPS = 4  # maps that a process keeps in memory
-_MAX_PHOTO_S = 3.0  # CPU time of a photo, without that of reading the map: 16 megapixels take 0.7 s
+TARGET = f"{__name__}:make_handler"  # function that a new process calls to get its handler
+PROCESSES = 3  # a robot uses at most one; the last free one serves only a tenant without one (`FairThreads`)
+_CACHED_MAPS = 4  # maps that one process keeps in memory
+_MAX_PHOTO_S = 3.0  # CPU time limit of one photo after its map was read; a photo of 16 megapixels takes 0.7 s
 
 
 class _Request(msgspec.Struct, frozen=True, kw_only=True):
-    """A *photo* to localise in a map, or None for the outline of the map.
+    """A request to a process: localise *photo* in the map *name*, or return the map's outline if it is None.
 
-    *version* and *data* are those of the map where the process cannot read the store itself.
+    *version* and *data*, the bytes of the map, are sent only if the process cannot read the store itself.
     """
 
     tenant: str
@@ -49,7 +49,7 @@ class _Request(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PhotoLocaliser:
-    """Localises photos in *processes*, which have the target `TARGET`."""
+    """Localises photos in *processes*, which must have been made with `TARGET`."""
 
     def __init__(self, processes: RobotProcesses) -> None:
         self.count = processes.count
@@ -58,26 +58,26 @@ class PhotoLocaliser:
     def localise(
         self, robot: RobotId, name: str, photo: bytes, lens: PhotoLens, charge: Callable[[float], None]
     ) -> PhotoLocation:
-        """Return where *photo*, which *robot* sent, was taken in the head of the map *name*; blocks.
+        """Return the pose of *photo* in the head of the map *name*; block until it is computed.
 
-        *charge* gets the CPU seconds that it took, also if it fails.
+        *charge* is called with the CPU seconds that the photo took, also if localising it fails.
 
         Raises:
-            NotFound: The robot's tenant has no such map.
-            BadRequest, LimitExceeded, InvalidCamera: As `localise_photo` says.
-            MissingExtra: The server lacks what localises.
-            Crashed, Busy, Expired, WorkerLost: As `RobotProcesses.call` says.
+            NotFound: The tenant of *robot* has no such map.
+            BadRequest, LimitExceeded, InvalidCamera: See `localise_photo`.
+            MissingExtra: OpenCV is not installed on the server.
+            Crashed, Busy, Expired, WorkerLost: See `RobotProcesses.call`.
         """
         reply = self._call(robot, _Request(tenant=robot.tenant, name=name, photo=photo, lens=lens), charge)
         return msgspec.msgpack.decode(reply, type=PhotoLocation)
 
     def outline(self, robot: RobotId, name: str, charge: Callable[[float], None]) -> MapOutline:
-        """Return the head of the map *name* as it is seen from above; blocks, and raises as `localise`."""
+        """Return the head of the map *name* as seen from above; block, and raise the errors of `localise`."""
         reply = self._call(robot, _Request(tenant=robot.tenant, name=name), charge)
         return msgspec.msgpack.decode(reply, type=MapOutline)
 
     def close(self) -> None:
-        """End the processes; a call that is under way raises WorkerLost."""
+        """Kill the processes; a running call raises WorkerLost."""
         self._processes.close()
 
     def _call(self, robot: RobotId, request: _Request, charge: Callable[[float], None]) -> bytes:
@@ -91,12 +91,15 @@ class PhotoLocaliser:
 
 
 def make_handler(configuration: str) -> Handler:
-    """Import what localises and return what answers in the process; *configuration* has the settings."""
+    """Import OpenCV and the localiser, and return the function that answers requests in the process.
+
+    *configuration* is the platform's settings as JSON.
+    """
     from rse_pf.images import load_opencv
     from rse_pf.services.mapping.photo import localise_photo, location_of, outline_of
 
     settings = PlatformSettings.from_dict(json.loads(configuration))
-    with contextlib.suppress(MissingExtra):  # the answer to each request says so
+    with contextlib.suppress(MissingExtra):  # each request is answered with this error instead
         load_opencv()
     maps = _Maps(settings)
 
@@ -115,7 +118,7 @@ def make_handler(configuration: str) -> Handler:
 
 
 class _Maps:
-    """The maps that a process has read last, of as many tenants as there are."""
+    """The cache of a process: the maps that it used last, with their indexes, of any tenants."""
 
     def __init__(self, settings: PlatformSettings) -> None:
         self._store = shared_store(settings)
@@ -123,11 +126,11 @@ class _Maps:
         self._known: OrderedDict[tuple[str, str, str], tuple[MapVersion, MapIndex]] = OrderedDict()
 
     def find(self, request: _Request) -> tuple[str, MapVersion, MapIndex]:
-        """Return the version, the map and its index that *request* names.
+        """Return the version id, the map and the index of the map that *request* names, read it if necessary.
 
         Raises:
-            NotFound: There is no such map of this tenant.
-            LimitExceeded: It holds no keyframe, or more than are computed with.
+            NotFound: The tenant has no such map.
+            LimitExceeded: The map has no keyframes, or more keyframes or features than the limits allow.
         """
         from rse_pf.services.mapping.place import index_map
 
@@ -146,6 +149,7 @@ class _Maps:
         return version, *found
 
     def _superfluous(self) -> tuple[str, str, str]:
-        """Return the map that was used least recently of the tenant that has most."""
+        """Return the key of the map to drop: of the tenant with most cached maps, the least recently used."""
         counts = Counter(tenant for tenant, _, _ in self._known)
-        return max(self._known, key=lambda key: counts[key[0]])  # the first of equals is the oldest
+        # Of equal tenants `max` returns the first map, which was used least recently.
+        return max(self._known, key=lambda key: counts[key[0]])

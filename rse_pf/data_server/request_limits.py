@@ -1,11 +1,11 @@
-"""Decide whether a request of a robot is accepted: by its rate, its requests in progress, and bodies in
-memory.
+"""Accept or refuse a robot's request, by its rate, its requests in progress, and the bodies held in memory.
 
 1. Rate: each robot has a token bucket, and a request takes as many tokens as its route costs.
-2. Requests in progress: at most `MAX_REQUESTS_PER_ROBOT` of a robot.
-3. Bodies in memory: at most ``data.max_uploads`` of all robots, and a share of them for one robot and one
-   tenant. When all places are taken, the slowest body of the robot that holds most places, of the tenant that
-   holds most, is refused in favour of the new one.
+2. Requests in progress: at most `MAX_REQUESTS_PER_ROBOT` of one robot.
+3. Bodies in memory: at most ``data.max_uploads`` bodies of all robots, and a fraction of that number of one
+   robot and of one tenant.  At a limit of all robots or of a tenant, a new body may displace another one that
+   is still being received: the slowest body of the robot with most bodies, of the tenant with most bodies.
+   The displaced request is refused.
 
 Time is an argument.
 """
@@ -23,16 +23,16 @@ from rse_pf.limits.token_bucket import TokenBucket
 
 __all__ = ["RequestLimits"]
 
-_BURST_S = 4.0  # size of a robot's token bucket: the requests of this time may come at once
-_MAX_ROBOTS = 10_000  # robots whose buckets are remembered
-MAX_REQUESTS_PER_ROBOT = 8  # requests of one robot in progress; more are refused
-_BODIES_PER_ROBOT = 0.25  # of ``data.max_uploads``
-_BODIES_PER_TENANT = 0.75  # of ``data.max_uploads``
-_RETRY_AFTER_MS = 1000.0  # after a refusal for lack of a place: most bodies are received within this time
-_REFUSED_BYTES = 64 << 10  # bytes of a refused body that take one token, because they are read and dropped
-_REFUSED_COST = 32.0  # most tokens that one refused body takes: those of 2 MiB
+_BURST_S = 4.0  # size of a token bucket: a robot may send the requests of 4 s at its full rate at once
+_MAX_ROBOTS = 10_000  # number of robots whose token buckets are remembered, to bound memory
+MAX_REQUESTS_PER_ROBOT = 8  # requests of one robot in progress at a time; more are refused
+_ROBOT_BODIES_FRACTION = 0.25  # fraction of ``data.max_uploads`` that the bodies of one robot may hold
+_TENANT_BODIES_FRACTION = 0.75  # fraction of ``data.max_uploads`` that the bodies of one tenant may hold
+_RETRY_AFTER_MS = 1000.0  # Retry-After of a refusal at a limit on requests or bodies: most end within 1 s
+_REFUSED_BYTES_PER_TOKEN = 64 << 10  # a body that is read and then refused costs one token for each 64 KiB
+_MAX_REFUSED_TOKENS = 32.0  # most tokens that one refused body costs: those of 2 MiB
 
-CPU_S_PER_REQUEST = 0.005  # CPU seconds that one token pays for; more work takes further tokens afterwards
+CPU_S_PER_REQUEST = 0.005  # CPU seconds that one token pays for; more CPU time costs tokens afterwards
 
 
 @dataclass(slots=True)
@@ -42,33 +42,35 @@ class _Robot:
 
 
 class RequestLimits:
-    """The requests of all robots that one data server works on; used by one thread."""
+    """The limits on the requests of all robots to one data server; only the event loop's thread uses it."""
 
     def __init__(self, settings: DataSettings) -> None:
         self._settings = settings
         self._robots: OrderedDict[RobotId, _Robot] = OrderedDict()
         self._in_progress: dict[HttpRequest, RobotId] = {}
         self._bodies: dict[HttpRequest, RobotId] = {}
-        """The requests that have a place for their body."""
+        """Requests whose bodies may be held in memory, with their robots; at most ``data.max_uploads``."""
 
     @property
     def known_robots(self) -> int:
-        """How many robots are remembered; bounded, however many send."""
+        """The number of robots whose token buckets are remembered; about `_MAX_ROBOTS` at most."""
         return len(self._robots)
 
     def begin(self, request: HttpRequest, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
-        """Accept a request of *robot* until `end`; a request whose body gets no place takes its tokens, too.
+        """Accept *request* of *robot* and count it as in progress until `end`, or raise an error.
+
+        A request that is refused with Busy takes its tokens nevertheless.
 
         Args:
             request: The request.
             robot: The robot that sends it.
-            cost: Number of tokens that it takes.
+            cost: Number of tokens that the request takes from the robot's bucket.
             now: Monotonic seconds.
-            has_body: Whether its body will be held in memory.
+            has_body: Whether the body of the request will be held in memory.
 
         Raises:
-            TooManyRequests: The robot's rate or its requests in progress are at their limit.
-            Busy: Too many bodies are being received, of this robot, its tenant or all.
+            TooManyRequests: The robot's bucket is empty, or too many of its requests are in progress.
+            Busy: Too many bodies of this robot, of its tenant or of all robots are held in memory.
         """
         state = self._state_of(robot, now)
         if state.requests >= MAX_REQUESTS_PER_ROBOT:
@@ -87,59 +89,69 @@ class RequestLimits:
             )
         state.bucket.spend(cost, now)
         if has_body:
-            self._make_room(robot, now)
+            self._free_body_place(robot, now)
             self._bodies[request] = robot
         state.requests += 1
         self._in_progress[request] = robot
 
     def end(self, request: HttpRequest) -> None:
-        """Free the places of a request; its tokens stay taken."""
+        """Count *request* and its body no longer as in progress; the tokens that it took are not returned.
+
+        A request that was not accepted is ignored.
+        """
         robot = self._in_progress.pop(request, None)
         if robot is not None:
             self._robots[robot].requests -= 1
             self._bodies.pop(request, None)
 
     def charge_refused(self, robot: RobotId, body_bytes: int, now: float) -> None:
-        """Take tokens for the body of an accepted request that was refused later, since it was read for
-        nothing.
+        """Take tokens for the body of a request that `begin` accepted and its handler refused.
 
-        Bodies that `begin` refuses take none: their connections pause.
+        Such a body was read for nothing.  A request that `begin` refuses costs no tokens for its body: the
+        caller delays the reply instead.
 
         Args:
-            robot: The robot that sent it.
+            robot: The robot that sent the request.
             body_bytes: Length of the body, received or announced.
             now: Monotonic seconds.
         """
-        self._state_of(robot, now).bucket.spend(min(body_bytes / _REFUSED_BYTES, _REFUSED_COST), now)
+        self._state_of(robot, now).bucket.spend(
+            min(body_bytes / _REFUSED_BYTES_PER_TOKEN, _MAX_REFUSED_TOKENS), now
+        )
 
     def charge_cpu(self, robot: RobotId, cpu_s: float, paid: float, now: float) -> None:
-        """Take further tokens for the CPU time of a request, beyond those that it took when it began.
+        """Take further tokens for a request that used more CPU time than its tokens paid for.
 
-        One request takes at most a whole bucket, because the first request for a map has to read that map.
+        One request costs at most as many tokens as the bucket holds, because the first request for a map also
+        pays for reading that map.
 
         Args:
-            robot: The robot that sent it.
-            cpu_s: CPU seconds of the request.
-            paid: Tokens that it took when it began.
+            robot: The robot that sent the request.
+            cpu_s: CPU seconds that the request used.
+            paid: Tokens that the request took in `begin`.
             now: Monotonic seconds.
         """
         bucket = self._state_of(robot, now).bucket
         bucket.spend(max(0.0, min(cpu_s / CPU_S_PER_REQUEST, bucket.burst) - paid), now)
 
-    def _make_room(self, robot: RobotId, now: float) -> None:
-        """Free a place for a body of *robot* if it has none left; raises Busy."""
+    def _free_body_place(self, robot: RobotId, now: float) -> None:
+        """Displace another body if a limit leaves no place for one more body of *robot*; raises Busy.
+
+        Busy: *robot* is at its own limit, or no body is being received whose robot or tenant holds at least
+        two places more.
+        """
         of_robot = Counter(self._bodies.values())
         of_tenant = Counter(holder.tenant for holder in self._bodies.values())
         most = self._settings.max_uploads
         limits = (
-            (of_robot[robot], _share(most, _BODIES_PER_ROBOT), "this robot"),
-            (of_tenant[robot.tenant], _share(most, _BODIES_PER_TENANT), "this tenant"),
+            (of_robot[robot], _fraction_of(most, _ROBOT_BODIES_FRACTION), "this robot"),
+            (of_tenant[robot.tenant], _fraction_of(most, _TENANT_BODIES_FRACTION), "this tenant"),
             (len(self._bodies), most, "all robots"),
         )
         reached = next((limit for limit in limits if limit[0] >= limit[1]), None)
         if reached is None:
             return
-        # A complete body keeps its place: it is being processed, and waits for no client.
+        # Only a body that is still being received may be displaced; a complete one is being processed.
         receiving = [
             (request, holder)
             for request, holder in self._bodies.items()
@@ -154,8 +166,8 @@ class RequestLimits:
         is_other_tenant = holder.tenant != robot.tenant
         held = of_tenant[holder.tenant] if is_other_tenant else of_robot[holder]
         own = of_tenant[robot.tenant] if is_other_tenant else of_robot[robot]
-        # With one place fewer the holder must still have as many as this robot; otherwise both would lose
-        # their places in alternation.
+        # After the exchange the holder must still have at least as many places as this robot (or tenant);
+        # otherwise the two would displace each other's bodies in alternation.
         if slowest is None or held < own + 2 or reached is limits[0]:
             count, limit, whose = reached
             raise Busy(
@@ -183,7 +195,7 @@ class RequestLimits:
         return state
 
     def _forget_one(self, now: float) -> None:
-        """Forget the robot without requests for longest whose bucket is full, if there are too many."""
+        """Above `_MAX_ROBOTS` robots, forget the longest silent one with a full bucket and no request."""
         if len(self._robots) > _MAX_ROBOTS:
             for robot, state in self._robots.items():
                 if not state.requests and state.bucket.is_full(now):
@@ -191,5 +203,5 @@ class RequestLimits:
                     return
 
 
-def _share(most: int, share: float) -> int:
-    return max(1, int(most * share))
+def _fraction_of(most: int, fraction: float) -> int:
+    return max(1, int(most * fraction))

@@ -1,6 +1,6 @@
-"""Processes with limits on memory and CPU time, which decode the data of robots.
+"""Processes with limits on memory and CPU time, which decode maps and photos of robots.
 
-A robot whose data ended two of them is refused for a while (`CrashRecord`).
+A robot whose data crashed two processes is refused for a minute (`CrashRecord`).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from rse_pf.storage.object_store import ObjectStore
 __all__ = ["RobotProcesses", "max_map_bytes", "shared_store"]
 
 _PRIVATE_STORE = "memory:"
-"""The ``data.store`` that other processes cannot read."""
-_MAX_INFLATED = 4  # an inflated map may have this many times ``data.max_object_bytes``
-_WALL_S_PER_CPU_S = 3.0  # of the timeout: the processes have a low priority, and wait on a busy machine
+"""Value of ``data.store`` for a store in the memory of the data server, which other processes cannot read."""
+_MAX_INFLATED = 4  # a map may have this many times ``data.max_object_bytes`` after decompression
+_WALL_S_PER_CPU_S = 3.0  # timeout of a call per CPU second: processes of low priority wait on a busy machine
 
 
 def max_map_bytes(settings: PlatformSettings) -> int:
-    """Return the largest size of an inflated map."""
+    """Return the largest size of a map after decompression, in bytes."""
     return _MAX_INFLATED * settings.data.max_object_bytes
 
 
@@ -33,8 +33,8 @@ class RobotProcesses:
     """The processes of one data server for one kind of work; the first call starts them.
 
     Attributes:
-        count: Calls that are worked on at the same time.
-        private_store: The store if only the data server can read it, else None.
+        count: Number of calls that run at the same time.
+        private_store: The store if it is in the data server's memory; None if the processes can read it.
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class RobotProcesses:
         count: int = 1,
         processes: LimitedProcesses | None = None,
     ) -> None:
-        """Start nothing yet.
+        """Describe the processes; none is started yet.
 
         Args:
-            target: ``module:function``, which takes the settings in JSON and returns the handler.
-            settings: Groups data, serving and services.
-            store: Store of the data server; processes read it themselves unless it is in its memory.
+            target: ``module:function``; the function takes the settings as JSON and returns the handler.
+            settings: Settings of the platform, which the processes get, too.
+            store: Store of the data server; the processes read it themselves unless it is in memory.
             clock: Monotonic seconds.
-            count: Calls that run at the same time.
-            processes: The processes; None makes some with the limits of ``serving``.
+            count: Number of calls that run at the same time.
+            processes: The processes; None makes them, with the limits of the settings group ``serving``.
         """
         self.count = count
         self.private_store = store if settings.data.store == _PRIVATE_STORE else None
@@ -74,15 +74,16 @@ class RobotProcesses:
     def call(
         self, robot: RobotId, request: bytes, *, near: str = "", charge: Callable[[float], None] | None = None
     ) -> bytes:
-        """Return the reply of the handler to *request* of *robot*; blocks.
+        """Return the handler's reply to *request* of *robot*; block until it is there.
 
-        *near* and *charge* are those of `LimitedProcesses.call`.
+        *near* and *charge* are described at `LimitedProcesses.call`.
 
         Raises:
-            Crashed: The request ended the process that worked on it.
-            Busy: Earlier requests of this robot ended processes, or none was free in time.
-            Expired, WorkerLost: It was not answered, for another reason than its bytes.
-            RsePfError: What the handler raised.
+            Crashed: The request crashed its process or exceeded its limit on memory or CPU time.
+            Busy: Earlier requests of this robot crashed processes, or no process was free in time.
+            Expired: The work took longer than the timeout.
+            WorkerLost: The processes cannot be started, or were closed; the request is not the cause.
+            RsePfError: The error that the handler raised.
         """
         refusal = self._crashes.refusal(robot, self._clock())
         if refusal is not None:
@@ -94,10 +95,10 @@ class RobotProcesses:
             raise
 
     def close(self) -> None:
-        """End the processes; a call that is under way raises WorkerLost."""
+        """Kill the processes; a running call raises WorkerLost."""
         self._processes.close()
 
 
 def shared_store(settings: PlatformSettings) -> ObjectStore | None:
-    """Return the store as a process of its own reads it, None if only the data server can."""
+    """Open the store in another process than the data server; None if it is in the data server's memory."""
     return None if settings.data.store == _PRIVATE_STORE else open_data_store(settings)

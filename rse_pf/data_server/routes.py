@@ -1,7 +1,7 @@
 """The HTTP interface of the data service: its routes, their JSON types, and its OpenAPI document.
 
-The application and the OpenAPI document both read the table `ROUTES`, so they cannot disagree.  Nothing is
-read or sent here; `rse_pf.data_server.handlers` has one method for each route.
+The application and the OpenAPI document both read the table `ROUTES`, so they cannot disagree.  No request
+is handled here; `rse_pf.data_server.handlers` has one method for each route.
 """
 
 from __future__ import annotations
@@ -43,27 +43,33 @@ BYTES = "application/octet-stream"
 
 
 class StoredObject(msgspec.Struct, frozen=True, kw_only=True):
-    """An object: its sha256 and its length."""
+    """An object: its digest (sha256, hexadecimal) and its length in bytes."""
 
     digest: str
     size: int
 
 
 class ObjectPage(msgspec.Struct, frozen=True, kw_only=True):
-    """Objects of this robot, sorted by digest; the next page has ``after`` = *next*, unless it is null."""
+    """One page of this robot's objects, sorted by digest.
+
+    The next page is requested with ``after`` = *next*; *next* is null on the last page.
+    """
 
     objects: list[StoredObject]
     next: str | None = None
 
 
 class UploadBegin(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An object that will be sent in parts."""
+    """The length in bytes of an object that will be sent in parts."""
 
     size: int
 
 
 class PresignedPut(msgspec.Struct, frozen=True, kw_only=True):
-    """A URL of the bucket for one PUT of all bytes, with exactly these headers and no token."""
+    """A URL of the bucket for one PUT of the whole object, with exactly these headers and without a token.
+
+    It is valid for *life_s* seconds.
+    """
 
     url: str
     headers: dict[str, str]
@@ -71,9 +77,10 @@ class PresignedPut(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Upload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The state of an upload; the object is stored durably when *offset* is *size*.
+    """The state of an upload: the next part begins at byte *offset* and has at most *part_bytes* bytes.
 
-    With *direct* the robot may PUT the object directly to the bucket, and then begins the upload again.
+    The object is stored durably when *offset* equals *size*.  If *direct* is there, the robot may instead PUT
+    the object directly to the bucket, and then begins the upload again, which completes it.
     """
 
     digest: str
@@ -84,27 +91,30 @@ class Upload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class MapName(msgspec.Struct, frozen=True, kw_only=True):
-    """A map of this tenant."""
+    """A map of this tenant, with the id of its head, the current version."""
 
     name: str
     head: str
 
 
 class MapPage(msgspec.Struct, frozen=True, kw_only=True):
-    """All maps of this tenant."""
+    """All maps of this tenant, with their heads."""
 
     maps: list[MapName]
 
 
 class MapVersionInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A version of a map with its id."""
+    """A version of a map: its id, which names it in paths, and its record."""
 
     id: str
     record: MapRecord
 
 
 class Commit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Make an uploaded object the next version; *parent* is the head that the robot last read."""
+    """Make the uploaded object *digest* the next version of a map.
+
+    *parent* is the id of the head that the robot last read, null for the first version.
+    """
 
     digest: str
     parent: str | None = None
@@ -112,28 +122,28 @@ class Commit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class MoveHead(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Move the head to *version* if it still is *expected*."""
+    """Move the head of a map to *version* if the head still is *expected*."""
 
     version: str
     expected: str
 
 
 class Pruned(msgspec.Struct, frozen=True, kw_only=True):
-    """How many versions were removed, and how many bytes less the tenant is charged with."""
+    """The number of versions that were removed, and of bytes that no longer count against the quota."""
 
     removed: int
     freed_bytes: int
 
 
 class ServiceHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The state of the service."""
+    """The state of the service: ``ok`` or ``ready``."""
 
     status: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
-    """A header or query parameter."""
+    """A parameter of a request: *place* is ``header`` or ``query``, *doc* and *schema* describe its value."""
 
     name: str
     place: str
@@ -146,8 +156,13 @@ class Field:
 class Route:
     """One operation of the service.
 
-    A route whose *scope* is None needs no token; *body* and *replies* hold a msgspec type, ``bytes``, or None
-    for an empty body.  A request counts as *cost* requests against the robot's rate.
+    Attributes:
+        operation: Name of the method of `Handlers` that handles it.
+        scope: Scope that the token needs; None needs no token.
+        replies: Type of the reply's body by status: a msgspec type, ``bytes``, or None for no body.
+        fields: Headers and query parameters, besides the parameters of *path*.
+        body: Type of the request's body, as in *replies*.
+        cost: Number of tokens that a request takes from the bucket of its robot.
     """
 
     operation: str
@@ -162,14 +177,14 @@ class Route:
 
     @property
     def pattern(self) -> re.Pattern[str]:
-        """What the whole path must match; its groups are the path parameters."""
+        """The pattern that the whole path of a request must match; its groups are the path parameters."""
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
-# Tokens that a request takes from the bucket of its robot, where it takes more than one.
-PHOTO_COST = 10.0  # a photo is decoded and matched
-_LIST_COST = 5.0  # a list reads many names of the store
-_COMMIT_COST = 20.0  # a commit reads a whole map
+# Numbers of tokens that requests take from the bucket of their robot; all other requests take one.
+PHOTO_COST = 10.0  # cost of localising a photo, which is decoded and matched
+_LIST_COST = 5.0  # cost of a list, which reads many names of the store
+_COMMIT_COST = 20.0  # cost of a commit or of pruning versions, which read whole maps or many records
 _WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
 _IF_RANGE = Field(name="If-Range", place="header", doc="the ETag for which the range holds; else all bytes")
@@ -197,7 +212,7 @@ _LIMIT = Field(
 )
 
 _PIXELS = {"type": "number"}
-_LENS = (
+_LENS_FIELDS = (
     *(
         Field(name=name, place="query", doc=f"{name} of the camera, px", required=True, schema=_PIXELS)
         for name in ("fx", "fy", "cx", "cy")
@@ -213,11 +228,12 @@ _LENS = (
     Field(name="model", place="query", doc="of the lens: radial-tangential (the default) or fisheye"),
 )  # fmt: skip
 
-_CHANGED = {412: HttpFailure}
-_READ = {200: bytes, 206: bytes, 304: None, 307: None, 416: HttpFailure, **_CHANGED}
-_BAD, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
-_STORING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
-_WORKING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure}
+# Replies by status that several routes share.
+_FAILED_CONDITION = {412: HttpFailure}
+_READ_REPLIES = {200: bytes, 206: bytes, 304: None, 307: None, 416: HttpFailure, **_FAILED_CONDITION}
+_BAD_REQUEST, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
+_STORE_REPLIES = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
+_PROCESS_REPLIES = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure}
 _OBJECT, _UPLOAD = "/data/v1/objects/{digest}", "/data/v1/uploads/{digest}"
 _MAP, _VERSION = "/data/v1/maps/{name}/versions", "/data/v1/maps/{name}/versions/{version}"
 
@@ -239,12 +255,12 @@ ROUTES: tuple[Route, ...] = (
     Route(
         operation="list_objects", method="GET", path="/data/v1/objects", scope="data:read",
         cost=_LIST_COST,
-        doc="List this robot's objects", fields=(_AFTER, _LIMIT), replies={200: ObjectPage, **_BAD},
+        doc="List this robot's objects", fields=(_AFTER, _LIMIT), replies={200: ObjectPage, **_BAD_REQUEST},
     ),
     Route(
         operation="get_object", method="GET", path=_OBJECT, scope="data:read",
         fields=(_RANGE, _IF_RANGE, *_CONDITIONS, _DIRECT), doc="Return an object or one range of it",
-        replies={**_READ, **_NOT_FOUND},
+        replies={**_READ_REPLIES, **_NOT_FOUND},
     ),
     Route(
         operation="head_object", method="HEAD", path=_OBJECT, scope="data:read",
@@ -255,17 +271,20 @@ ROUTES: tuple[Route, ...] = (
         operation="put_object", method="PUT", path=_OBJECT, scope="data:write", body=bytes,
         fields=_CONDITIONS,
         doc="Store an object of at most data.part_bytes; 201 means that it is durable, 200 that it existed",
-        replies={200: StoredObject, 201: StoredObject, **_BAD, **_NOT_FOUND, **_CHANGED, **_STORING},
+        replies={
+            200: StoredObject, 201: StoredObject, **_BAD_REQUEST, **_NOT_FOUND, **_FAILED_CONDITION,
+            **_STORE_REPLIES,
+        },
     ),
     Route(
         operation="delete_object", method="DELETE", path=_OBJECT, scope="data:write",
         fields=_CONDITIONS, doc="Remove an object; a missing one is no error",
-        replies={204: None, **_NOT_FOUND, **_CHANGED},
+        replies={204: None, **_NOT_FOUND, **_FAILED_CONDITION},
     ),
     Route(
         operation="begin_upload", method="PUT", path=_UPLOAD, scope="data:write", body=UploadBegin,
         doc="Begin an upload in parts, or return the state of the open one",
-        replies={200: Upload, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
+        replies={200: Upload, **_BAD_REQUEST, **_NOT_FOUND, **_CONFLICT, **_STORE_REPLIES},
     ),
     Route(
         operation="get_upload", method="GET", path=_UPLOAD, scope="data:write",
@@ -279,7 +298,7 @@ ROUTES: tuple[Route, ...] = (
         operation="append_part", method="PATCH", path=_UPLOAD, scope="data:write", fields=(_OFFSET,),
         body=bytes,
         doc="Add a part; 201 means that it was the last one and the object is durable",
-        replies={200: Upload, 201: Upload, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
+        replies={200: Upload, 201: Upload, **_BAD_REQUEST, **_NOT_FOUND, **_CONFLICT, **_STORE_REPLIES},
     ),
     Route(
         operation="abandon_upload", method="DELETE", path=_UPLOAD, scope="data:write",
@@ -292,54 +311,56 @@ ROUTES: tuple[Route, ...] = (
     Route(
         operation="list_versions", method="GET", path=_MAP, scope="maps:read",
         cost=_LIST_COST, doc="List the versions of a map, oldest first",
-        replies={200: list[MapVersionInfo], **_BAD, **_NOT_FOUND},
+        replies={200: list[MapVersionInfo], **_BAD_REQUEST, **_NOT_FOUND},
     ),
     Route(
         operation="commit_version", method="POST", path=_MAP, scope="maps:write", body=Commit,
         cost=_COMMIT_COST,
         doc="Make an uploaded object the next version and the head of a map",
-        replies={201: MapVersionInfo, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
+        replies={201: MapVersionInfo, **_BAD_REQUEST, **_NOT_FOUND, **_CONFLICT, **_STORE_REPLIES},
     ),
     Route(
         operation="prune_versions", method="DELETE", path=_MAP, scope="maps:write", cost=_COMMIT_COST,
         fields=(_KEEP,), doc="Remove all but the newest versions of a map",
-        replies={200: Pruned, **_BAD, **_NOT_FOUND, 503: HttpFailure},
+        replies={200: Pruned, **_BAD_REQUEST, **_NOT_FOUND, 503: HttpFailure},
     ),
     Route(
         operation="show_version", method="GET", path=_VERSION, scope="maps:read",
         doc="Return the record of a version; head is the newest one",
-        replies={200: MapVersionInfo, **_BAD, **_NOT_FOUND},
+        replies={200: MapVersionInfo, **_BAD_REQUEST, **_NOT_FOUND},
     ),
     Route(
         operation="get_version", method="GET", path=_VERSION + "/content", scope="maps:read",
         fields=(_RANGE, _IF_RANGE, *_CONDITIONS, _DIRECT), doc="Return the bytes of a version",
-        replies={**_READ, **_BAD, **_NOT_FOUND},
+        replies={**_READ_REPLIES, **_BAD_REQUEST, **_NOT_FOUND},
     ),
     Route(
         operation="move_head", method="PUT", path="/data/v1/maps/{name}/head", scope="maps:write",
         body=MoveHead,
         doc="Move the head to another version, as a rollback does",
-        replies={200: MapVersionInfo, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
+        replies={200: MapVersionInfo, **_BAD_REQUEST, **_NOT_FOUND, **_CONFLICT, **_STORE_REPLIES},
     ),
     Route(
         operation="localise", method="POST", path=_LOCALISE, scope="maps:localise", body=bytes,
-        cost=PHOTO_COST, fields=_LENS, doc="Return where a photo, JPEG or PNG, was taken in a map",
-        replies={200: PhotoLocation, 501: HttpFailure, **_BAD, **_NOT_FOUND, **_WORKING},
+        cost=PHOTO_COST, fields=_LENS_FIELDS, doc="Return where a photo, JPEG or PNG, was taken in a map",
+        replies={200: PhotoLocation, 501: HttpFailure, **_BAD_REQUEST, **_NOT_FOUND, **_PROCESS_REPLIES},
     ),
     Route(
         operation="outline", method="GET", path=_LOCALISE, scope="maps:localise", cost=PHOTO_COST,
         doc="Return a map as it is seen from above",
-        replies={200: MapOutline, 501: HttpFailure, **_BAD, **_NOT_FOUND, **_WORKING},
+        replies={200: MapOutline, 501: HttpFailure, **_BAD_REQUEST, **_NOT_FOUND, **_PROCESS_REPLIES},
     ),
 )  # fmt: skip
-"""All routes; the handler of each is the method named *operation*."""
+"""All routes; the method of `Handlers` with the name *operation* handles a route."""
 
+# JSON schema of each path parameter.
 _PATH_SCHEMAS: dict[str, dict[str, Any]] = {
     "digest": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
     "name": {"type": "string", "pattern": "^[a-z0-9][a-z0-9-]{0,63}$"},
     "version": {"type": "string", "pattern": "^(head|[0-9a-f]{6,64})$"},
 }
 _JSON = "application/json"
+# The description of each HTTP status in the OpenAPI document.
 _DESCRIPTIONS = {
     304: "The client has it: its ETag is in If-None-Match",
     412: "If-Match or If-None-Match does not hold; nothing was read or changed",
@@ -356,7 +377,7 @@ _DESCRIPTIONS = {
 
 
 def openapi() -> dict[str, Any]:
-    """Return the document as JSON values, OpenAPI 3.1."""
+    """Return the OpenAPI 3.1 document of the service, as values that JSON can hold."""
     types = {kind for route in ROUTES for kind in (route.body, *route.replies.values())} - {None, bytes, dict}
     _, components = msgspec.json.schema_components(
         [HttpFailure, *sorted(types, key=str)], ref_template="#/components/schemas/{name}"
@@ -381,7 +402,7 @@ def openapi() -> dict[str, Any]:
 
 @functools.cache
 def openapi_page() -> str:
-    """Return the document as text: what ``rse-pf data --openapi`` prints."""
+    """Return the OpenAPI document as JSON text, as ``rse-pf data --openapi`` prints it."""
     return json.dumps(openapi(), indent=1, sort_keys=True) + "\n"
 
 

@@ -1,7 +1,7 @@
-"""Run the data service: one process, uvicorn, and a port that is announced when requests are answered.
+"""Run the data service: one process with uvicorn, which announces its port when it answers requests.
 
-What a crash left behind is removed before the first request.  On SIGTERM and SIGINT the process completes the
-requests that it has and ends, at most `_STOP_TIMEOUT_S` seconds later.
+Old uploads and temporary files of crashed writers are removed before the first request.  On SIGTERM and
+SIGINT the process completes the requests in progress and exits, at most `_STOP_TIMEOUT_S` seconds later.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from rse_pf.terminal import json_line, show
 
 __all__ = ["KeysFile", "serve_data"]
 
-_SWEEP_S = 3600.0  # between two deletions of old uploads
-_STOP_TIMEOUT_S = 10  # seconds to complete requests after a signal
-_MAX_IDLE = 2048  # connections that wait for their next request
-# Longest time that a thread keeps the interpreter lock: a PUT makes some twenty system calls, and may wait
-# for the lock after each.
-_SWITCH_S = 0.0005
+_SWEEP_PERIOD_S = 3600.0  # seconds between two deletions of old uploads and temporary files
+_STOP_TIMEOUT_S = 10  # seconds in which requests in progress may complete after SIGTERM or SIGINT
+_MAX_IDLE_CONNECTIONS = 2048  # connections that wait for their next request; above that the oldest is closed
+# Seconds for which a thread keeps the interpreter lock while others want it (`sys.setswitchinterval`): a PUT
+# makes some twenty system calls, and its thread may wait for the lock after each.
+_SWITCH_INTERVAL_S = 0.0005
 
 
 class KeysFile:
-    """Public keys in a file, with roster and deny list in the same folder, read again periodically."""
+    """The public keys in the file *path*, with roster and deny list in its folder, read again every 0.5 s."""
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._trust = TrustStore(path)
@@ -51,7 +51,7 @@ class KeysFile:
         self._refreshed_s = float("-inf")
 
     def __call__(self) -> KeySet | None:
-        """Return the keys; None while there are none."""
+        """Return the keys, read again if they are older than `REFRESH_S`; None if none was ever read."""
         if self._clock() - self._refreshed_s >= REFRESH_S:
             self._refreshed_s = self._clock()
             self._trust.refresh()
@@ -66,35 +66,37 @@ def serve_data(
     announce: Path | None,
     audit: Path | None = None,
 ) -> int:
-    """Serve until a signal ends the process; return the exit code.
+    """Serve requests until SIGTERM or SIGINT arrives; return the exit code 0.
 
     Args:
         settings: Settings of the platform; with ``data.port`` 0 a free port is chosen.
         store: Store of objects and maps.
-        keys: Returns the keys that may sign tokens, for each request.
-        announce: File that gets pid and port as JSON when requests are answered.
+        keys: Returns the keys that may sign tokens; called for each request.
+        announce: File into which pid and port are written as JSON when the server answers requests; None
+            writes no file.
         audit: Folder of the audit log; None records nothing.
 
     Raises:
-        ConfigurationError: The address is taken, or the audit log cannot be written.
+        ConfigurationError: The server cannot listen on its address, or the audit log cannot be written.
         MissingExtra: uvicorn or uvloop is not installed.
     """
     try:
         import uvicorn
     except ImportError as error:
         raise MissingExtra("uvicorn", "backend") from error
-    sys.setswitchinterval(_SWITCH_S)
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     log = None if audit is None else _audit_log(audit, settings)
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
-    keys()  # reads the keys, and imports what verifies tokens, before the first request
+    keys()  # reads the keys and imports the cryptography before the first request, which is then not slow
     listening = _listen(settings)
     config = uvicorn.Config(
-        app, http=bounded_protocol(most_idle=_MAX_IDLE, ends_with_client=True), ws="none", lifespan="off",
-        access_log=False, log_level="warning", backlog=BACKLOG, server_header=False, date_header=False,
-        proxy_headers=False, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+        app, http=bounded_protocol(most_idle=_MAX_IDLE_CONNECTIONS, ends_with_client=True), ws="none",
+        lifespan="off", access_log=False, log_level="warning", backlog=BACKLOG, server_header=False,
+        date_header=False, proxy_headers=False, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
-        # uvicorn repeats the signal to itself when it has ended; the exit code is 0 all the same
+        # uvicorn sends the signal to its own process again when it has stopped; without a handler that
+        # would kill the process, and the exit code would not be 0.
         signal.signal(number, lambda number, frame: None)
     try:
         run_in_loop(_run(uvicorn.Server(config), app, store, listening, settings, announce))
@@ -136,7 +138,7 @@ async def _run(
 
 async def _sweep_periodically(app: DataServer, store: ObjectStore) -> None:
     while True:
-        await asyncio.sleep(_SWEEP_S)
+        await asyncio.sleep(_SWEEP_PERIOD_S)
         await asyncio.to_thread(_sweep, app, store)
 
 
@@ -159,8 +161,8 @@ def _listen(settings: PlatformSettings) -> socket.socket:
         listening = socket.create_server(
             (host, port), backlog=BACKLOG, family=socket.AF_INET6 if ":" in host else socket.AF_INET
         )
-        # asyncio does this only for sockets that name their protocol; a reply is a head and a body, and
-        # without it the body waits 40 ms for the delayed acknowledgement of the head.
+        # asyncio sets TCP_NODELAY only on sockets that name their protocol.  A reply is sent as a head and a
+        # body; without the option the body waits 40 ms for the delayed acknowledgement of the head.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as error:
