@@ -1,4 +1,4 @@
-"""Pure rules of scaling: when servers count as busy, idle or unhealthy, and what to do then.
+"""Pure rules of scaling: when servers count as busy, idle or unhealthy, and how the fleet changes then.
 
-Decisions on values belong here; measuring, starting and stopping servers do not.
+Decisions on values belong here; the code that measures, starts and stops servers does not.
 """

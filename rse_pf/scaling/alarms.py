@@ -1,7 +1,7 @@
 """The rules of scaling as CloudWatch data: metrics, alarms and step adjustments.
 
-The stacks write the alarms into the template; tests read them back from it and compare them with
-`rse_pf.scaling.policy.decide` on the same load.
+The stacks write the alarms into the CloudFormation template.  Tests read them from the template, and compare
+their decisions with those of `rse_pf.scaling.policy.decide` on the same load.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from rse_pf.scaling.rules import Field, ScalingRule, ScalingStep, rules_of
 __all__ = ["CPU", "NAMESPACE", "Alarm", "Metric", "alarms_of"]
 
 NAMESPACE = "RsePf"
-"""CloudWatch namespace of what the backend servers publish."""
+"""CloudWatch namespace of the metrics that the agents of the backend servers publish."""
 
 CPU = "CpuPercent"
-"""CPU of a server past its warm-up; published in the fast profile only."""
+"""Metric of a server's CPU utilisation in percent, after its warm-up; published in the fast profile only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metric:
-    """One time series; ``name`` is its name in an expression."""
+    """A CloudWatch metric with its statistic; ``name`` is its name in the expression of an `Alarm`."""
 
     name: str
     namespace: str
@@ -33,9 +33,10 @@ class Metric:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm:
-    """An alarm and the step policy that runs while its state is ALARM: at once, and then every minute.
+    """A CloudWatch alarm, and the step policy that runs when its state becomes ALARM and then every minute.
 
-    ``comparison`` and ``missing`` are terms of CloudWatch; *periods* of *periods* must breach.
+    The state becomes ALARM when *expression* breaches *threshold* in *periods* consecutive periods of
+    *period_s* seconds.  ``comparison`` and ``missing`` (treatment of missing data) are CloudWatch's terms.
     """
 
     name: str
@@ -57,15 +58,15 @@ _METRICS: dict[Field, Metric] = {
     "requests": Metric(name="requests", namespace=NAMESPACE, metric="Requests", statistic="Sum"),
     "robots_per_server": Metric(name="robots", namespace=NAMESPACE, metric="Robots", statistic="Average"),
 }  # fmt: skip
-"""The metric of each field of a `rse_pf.scaling.rules.Sample`."""
+"""The CloudWatch metric that gives each field of a `rse_pf.scaling.rules.Sample`, in the paper's profile."""
 _FAST_METRICS: dict[Field, Metric] = {
     **_METRICS, "cpu_percent": Metric(name="cpu", namespace=NAMESPACE, metric=CPU, statistic="Average"),
 }  # fmt: skip
-"""The same in the fast profile: EC2 publishes its CPU only each minute."""
+"""As `_METRICS`, in the fast profile: the servers publish their CPU, because EC2 does so only each minute."""
 
 
 def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
-    """Return one alarm for each of `rules_of`, in the same order.
+    """Return an alarm for each rule of `rules_of`, in the same order.
 
     Missing data never breaches: a fleet without data neither grows nor shrinks.
     """
@@ -73,7 +74,11 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
 
 
 def _alarm_of(rule: ScalingRule, settings: ScalingSettings) -> Alarm:
-    """Return *rule* as an alarm: on its metric if it adds servers, else on an expression that is 0 or 1."""
+    """Return the alarm of *rule*.
+
+    A rule that adds servers compares its metric with its limit.  A rule that removes one has an expression
+    that is 1 while all its conditions hold, else 0, and the threshold 1.
+    """
     cadence = cadence_of(settings)
     of_field = _FAST_METRICS if cadence.is_fast else _METRICS
     metrics = tuple(of_field[condition.field] for condition in rule.conditions)

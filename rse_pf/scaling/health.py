@@ -1,6 +1,7 @@
-"""The health of a server by its checks, as in a target group of the ALB.
+"""Decide from health checks whether a server is healthy, by the rule of a target group of the AWS ALB.
 
-Consecutive results decide, after a grace period.  The ALB, Envoy and this rule use the same limits.
+A number of equal results in a row changes the state; failures count only after a grace period.  The ALB,
+Envoy on one machine, and this rule use the same limits.
 """
 
 from __future__ import annotations
@@ -27,30 +28,34 @@ __all__ = [
     "time_to_notice_s",
 ]
 
-# Successful checks in a row after which a server is healthy: the least that the ALB offers.
+# Number of successful checks in a row after which a server is healthy: the least that the ALB offers.
 HEALTHY_CHECKS = 2
-# Seconds between two checks on one machine: a crash is noticed within half a second.
+# Seconds between two checks of a server of a local platform: a crash is noticed within half a second.
 LOCAL_INTERVAL_S = 0.25
-# Time limit of a check on one machine, in seconds.
+# Time limit of a check of a server of a local platform, in seconds.
 LOCAL_TIMEOUT_S = 0.25
 # Seconds between two checks of the ALB: the least that it offers.
 CLOUD_INTERVAL_S = 5
 # Time limit of a check of the ALB, in seconds: it must be shorter than the interval.
 CLOUD_TIMEOUT_S = 4
-# Seconds for which failed checks of a new server do not count: its start of about 75 s, and some more.
+# Seconds after its start in which failed checks of a new server do not count: it is ready after about 75 s.
 GRACE_S = 90
-# Seconds that the termination hook gives a server to drain.
+# Seconds in which a server must drain before its instance is terminated: the termination hook waits so long.
 DRAIN_S = 60
-# Largest percentage of the wanted servers while servers are replaced: one more at a time in fleets of up to
-# 19, so that a bad release stops at the first server.
+# Most servers while some are replaced, in percent of the wanted number: fleets of up to 19 servers get one
+# additional server at a time, so that a bad release stops at the first server.
 MAX_HEALTHY_PERCENT = 110
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """The health of one server.
+    """The health of one server, as its checks up to now show it.
 
-    ``row`` counts equal results in a row; the grace period begins at ``started_s``.
+    Attributes:
+        started_s: Time at which the server was started and its grace period began.
+        state: ``starting`` until the server was healthy, or unhealthy after the grace period.
+        last_ok: Whether the last check succeeded.
+        row: Number of checks in a row with the result of the last one.
     """
 
     started_s: float
@@ -60,10 +65,11 @@ class Health:
 
 
 def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
-    """Return port and path of the ALB's check of each target group: ``robots``, and the services that run.
+    """Return port and path of the ALB's health check, for each target group by name.
 
-    A server that fails any check is replaced.  Therefore no check may depend on anything that all servers
-    share, such as the bucket: its failure would replace all servers at once.
+    The groups are ``robots`` and, if these services are enabled, ``data`` and ``rosbridge``.  A server that
+    fails any check is replaced.  Therefore no check may depend on a resource that all servers share, such as
+    the bucket: its failure would replace all servers at once.
     """
     checks = {"robots": (settings.serving.control_port, READY_PATH)}
     if settings.data.enabled:
@@ -74,10 +80,11 @@ def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
 
 
 def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float) -> Health:
-    """Return the health after one more check.
+    """Return the health of a server after one more check, which succeeded if *ok*.
 
     A server becomes healthy after `HEALTHY_CHECKS` successes in a row, and unhealthy after
-    ``unhealthy_checks`` failures; a server that was never healthy becomes unhealthy only after `GRACE_S`.
+    ``settings.unhealthy_checks`` failures in a row.  A server that was never healthy becomes unhealthy only
+    `GRACE_S` after its start.  *now_s* is on the clock of ``started_s``.
     """
     row = health.row + 1 if ok == health.last_ok else 1
     state = health.state
@@ -90,7 +97,10 @@ def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float)
 
 
 def time_to_notice_s(settings: HealthSettings, *, local: bool) -> float:
-    """Return the longest time from a failure to its detection, in seconds; a drain waits for it."""
+    """Return the longest time in seconds until the load balancer notices that a server is not ready.
+
+    A draining server keeps working for this time.  *local* selects a local platform instead of AWS.
+    """
     interval_s = LOCAL_INTERVAL_S if local else CLOUD_INTERVAL_S
     timeout_s = LOCAL_TIMEOUT_S if local else CLOUD_TIMEOUT_S
     return interval_s * settings.unhealthy_checks + timeout_s

@@ -1,8 +1,8 @@
 """The alarms that notify an operator, as data: metrics, expression, and meaning.
 
-They scale nothing.  The stacks write them into a template, `rse_pf.extensions.costs.bill` counts them, and
-each has a chapter of its own in docs/operations.md.  A parked platform has no servers on purpose: alarms
-about servers then stay in the state OK, because they compare with the wanted size of the group.
+These alarms do not scale the fleet.  The stacks write them into a template, `rse_pf.extensions.costs.bill`
+counts them, and each has a chapter in docs/operations.md.  A parked platform has no servers on purpose:
+alarms about servers then stay in the state OK, because they compare with the wanted size of the group.
 """
 
 from __future__ import annotations
@@ -29,32 +29,39 @@ __all__ = [
 
 # Time limit of one execution of the serverless PnP, in seconds: twice the deadline of a command.
 LAMBDA_TIMEOUT_S = 10
-# An execution is slow that takes more of its time limit than this share: the next ones may fail by the limit.
-_SLOW_SHARE = 0.8
-# Blocked requests in a minute that notify: as many as ten robots send that dial at their full rate.
+# Fraction of `LAMBDA_TIMEOUT_S` above which the 95th percentile of the execution times raises the alarm
+# lambda-slow, before executions fail at the limit.
+_SLOW_FRACTION = 0.8
+# Requests in a minute that the web firewall must block for an alarm: as many as ten robots send that connect
+# again at their full rate.
 _BLOCKED_PER_PERIOD = 100.0
 # Period of most alarms, in seconds: AWS publishes its own metrics each minute.
 _PERIOD_S = 60
 # Shortest period of the alarm on silent agents, in seconds: an agent that restarts misses a sample or two.
-_LONG_PERIOD_S = 300
-# Metric that an agent publishes while the bucket does not answer its server; it costs nothing otherwise.
+_MIN_SILENT_PERIOD_S = 300
+# Metric that an agent publishes, as 1, while the bucket does not answer its server.  While nothing is
+# published, the metric costs nothing.
 STORE_ERRORS = "StoreErrors"
-# Time between two checks of the bucket, in seconds: the shortest period that an alarm may have.
+# Time between two checks of the bucket by an agent, in seconds: the shortest period that an alarm may have.
 STORE_PERIOD_S = 10
-# Metric of the workers that a crash in native code ended in a period; an agent does not publish 0.
+# Metric of the number of workers that crashed in native code in a period; an agent does not publish 0.
 NATIVE_CRASHES = "NativeCrashes"
-# Metric that an agent publishes, as 1, while less than `LOW_DISK_PERCENT` of its server's disk are free.
+# Metric that an agent publishes, as 1, while less than `LOW_DISK_PERCENT` of its server's disk is free.
 DISK_LOW = "DiskLow"
-# Free share of a disk below which an operator is notified: 0.8 GB of a server's volume, for days of logs.
+# Percentage of free disk space below which an operator is notified: 0.8 GB, which last for days of logs.
 LOW_DISK_PERCENT = 10.0
 
 Source = str
-"""Origin of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
+"""The resource that a series is about, which determines its dimensions in CloudWatch.
+
+One of ``group`` (Auto Scaling group), ``balancer`` (load balancer), ``targets`` (the robots' target group),
+``firewall`` (web firewall), ``function`` (serverless PnP) and ``canary``.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """One metric; ``name`` is its name in an expression, and the dimensions are those of *source*."""
+    """A CloudWatch metric with its statistic; ``name`` is its name in an `OperatorAlarm`'s expression."""
 
     name: str
     namespace: str
@@ -65,7 +72,11 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorAlarm:
-    """An alarm whose expression is 1 while something is wrong, in *datapoints* of *periods*."""
+    """An alarm whose *expression* over *series* is 1 while something is wrong, else 0.
+
+    It notifies when the expression was 1 in *datapoints* of the last *periods* periods of *period_s* seconds.
+    ``missing`` (the treatment of missing data) and ``comparison`` are CloudWatch's terms.
+    """
 
     name: str
     meaning: str
@@ -81,7 +92,7 @@ class OperatorAlarm:
 
     @property
     def sources(self) -> set[Source]:
-        """Return whose metrics the alarm needs."""
+        """Return the sources of the metrics that the alarm reads."""
         return {series.source for series in self.series}
 
 
@@ -125,16 +136,19 @@ _BLOCKED = Series(
 
 
 def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
-    """Return the alarms of a deployment with *settings*."""
-    floor, slow_ms = settings.scaling.min_servers, LAMBDA_TIMEOUT_S * 1e3 * _SLOW_SHARE
+    """Return the alarms of a deployment with *settings*.
+
+    The alarm ``store`` exists only with ``data.enabled``, the alarm ``canary`` only with ``cloud.canary``.
+    """
+    floor, slow_ms = settings.scaling.min_servers, LAMBDA_TIMEOUT_S * 1e3 * _SLOW_FRACTION
     sample_s = cadence_of(settings.scaling).period_s
-    silent_s = sample_s * math.ceil(_LONG_PERIOD_S / sample_s)
+    silent_s = sample_s * math.ceil(_MIN_SILENT_PERIOD_S / sample_s)
     alarms = [
         OperatorAlarm(
             name="few-servers",
             meaning=f"fewer servers are healthy than scaling.min_servers = {floor}",
             series=(_HEALTHY, _WANTED),
-            # A target group without targets publishes nothing; a group that is gone wants nothing.
+            # A target group without targets publishes nothing: healthy counts as 0.  A parked group wants 0.
             expression=f"IF(FILL(wanted, {floor}) > 0 AND FILL(healthy, 0) < {floor}, 1, 0)",
             periods=5,
             datapoints=5,
@@ -162,7 +176,8 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             name="silent-agent",
             meaning="a server in service publishes no metrics: its agent is down, or cannot reach AWS",
             series=(_REPORTS, _SERVING),
-            # Each server reports once in a sample; half of the reports of one server may be late.
+            # Each server reports once in a sample; the alarm needs more than half of one server's reports
+            # to be missing, because some may be late.
             expression=f"IF(FILL(reports, 0) < (FILL(serving, 0) - 0.5) * {silent_s // sample_s}, 1, 0)",
             period_s=silent_s,
             periods=2,
@@ -170,7 +185,7 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
         ),
         OperatorAlarm(
             name="native-crashes",
-            meaning="native code ended a worker of a server",
+            meaning="a worker of a server crashed in native code",
             series=(_NATIVE_CRASHES,),
             expression="IF(crashes >= 1, 1, 0)",
             periods=1,
@@ -181,7 +196,7 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             meaning=f"less than {LOW_DISK_PERCENT:g} % of a server's disk are free",
             series=(_DISK_LOW,),
             expression="IF(low >= 1, 1, 0)",
-            period_s=max(_PERIOD_S, sample_s),  # agents publish once in a sample
+            period_s=max(_PERIOD_S, sample_s),  # agents publish only once in a sample
         ),
         OperatorAlarm(
             name="lambda-errors",
@@ -199,7 +214,7 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
         ),
         OperatorAlarm(
             name="lambda-slow",
-            meaning=f"executions of the serverless PnP take more than {_SLOW_SHARE:.0%} of their time-out",
+            meaning=f"executions of the serverless PnP take more than {_SLOW_FRACTION:.0%} of their time-out",
             series=(_function("duration", "Duration", "p95"),),
             expression=f"IF(duration >= {slow_ms:g}, 1, 0)",
             datapoints=2,

@@ -1,8 +1,8 @@
 """Decide when the platform grows, shrinks or replaces a server: the paper's scale modifier as a pure rule.
 
 `decide` takes measurements and the time, keeps no state between calls, and returns what the caller has to do.
-A period without a sample is no reason to act.  The rules are those of `rse_pf.scaling.rules`; CloudWatch
-applies the same ones on AWS, and a test compares the two, in both profiles.
+A rule never acts on a period without a sample.  The rules are those of `rse_pf.scaling.rules`; on AWS
+CloudWatch applies the same rules, and a test compares `decide` with CloudWatch's alarms in both profiles.
 """
 
 from __future__ import annotations
@@ -23,9 +23,13 @@ Kind = Literal["grow", "shrink", "replace", "stay"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetState:
-    """The current servers: their number, those still warming up, and the names of the unhealthy ones.
+    """The servers of the fleet now.
 
-    ``acted_s`` is when the number of servers was last changed: each period leads to one change at most.
+    Attributes:
+        servers: Number of servers, those that warm up included.
+        warming: Number of servers that still warm up.
+        unhealthy: Names of the servers that failed their health checks.
+        acted_s: Time at which the number of servers last changed; each period leads to one change at most.
     """
 
     servers: int
@@ -36,7 +40,14 @@ class FleetState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Action:
-    """One action.  ``names`` are the servers to replace; ``reason`` is for the log."""
+    """One action on the fleet.
+
+    Attributes:
+        kind: ``grow``, ``shrink``, ``replace`` or ``stay``.
+        servers: Number of servers to add, remove or replace; 0 for ``stay``.
+        names: The servers to replace; empty for other kinds.
+        reason: Text for the log.
+    """
 
     kind: Kind
     servers: int = 0
@@ -53,20 +64,21 @@ def decide(
     compress: float = 1.0,
     since_s: Mapping[str, float] | None = None,
 ) -> tuple[Action, ...]:
-    """Return what to do now: replacements first, then exactly one of grow, shrink or stay.
+    """Return what to do now: one replacement if servers are unhealthy, then one of grow, shrink or stay.
 
-    A platform that stays busy grows again every minute, or every period where that is longer; servers that
-    still warm up count as already added, as in step scaling of Amazon EC2 Auto Scaling, and block every
-    shrink.
+    A fleet below ``scaling.min_servers`` grows at once to this number; otherwise each period leads to one
+    change at most.  A platform that stays busy grows again every minute, or every period if a period is
+    longer.  Servers that still warm up count as already added, as in step scaling of Amazon EC2 Auto Scaling;
+    while there are any, the fleet does not shrink.
 
     Args:
-        samples: Whole periods, in order; later ones than *now_s* are ignored.
+        samples: Measurements of whole periods, in order; those that begin after *now_s* are ignored.
         fleet: The servers now.
         settings: Profile, thresholds and limits.
         now_s: Seconds, on the clock of the samples.
-        compress: Factor by which periods are shorter; for experiments.
-        since_s: What `find_rule_starts` returned; None finds it in *samples*, which must then
-            reach back so far.
+        compress: Factor by which periods are shorter than the settings say; for experiments.
+        since_s: The result of `find_rule_starts`; None computes it from *samples*, which must then reach back
+            to the first sample of each rule that holds.
 
     Source:
         RSE-PF paper, Sect. 6.2: busy above 70 % CPU, one server less after five idle minutes.
@@ -83,11 +95,11 @@ def decide(
         )
     cadence = cadence_of(settings)
     period_s = cadence.period_s / compress
-    ended = _periods(now_s, period_s)
+    ended = _count_periods(now_s, period_s)
     if fleet.servers < settings.min_servers:
         missing = settings.min_servers - fleet.servers
         return (*replacements, Action(kind="grow", servers=missing, reason="fewer than scaling.min_servers"))
-    if math.isfinite(fleet.acted_s) and ended <= _periods(fleet.acted_s, period_s):
+    if math.isfinite(fleet.acted_s) and ended <= _count_periods(fleet.acted_s, period_s):
         return (*replacements, Action(kind="stay", reason="this period has led to an action already"))
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
     if since_s is None:
@@ -96,7 +108,7 @@ def decide(
         rule
         for rule in rules_of(settings)
         if rule.name in since_s
-        and (ended - _periods(since_s[rule.name], period_s)) % cadence.repeat == 0
+        and (ended - _count_periods(since_s[rule.name], period_s)) % cadence.repeat == 0
         and ended - 1 in by_period
     ]
     return (*replacements, _scale(acting, by_period.get(ended - 1), fleet, settings))
@@ -110,18 +122,21 @@ def find_rule_starts(
     compress: float = 1.0,
     before: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Return since when each rule that holds now has held without a break, by its name, in seconds.
+    """Return, by name, the time in seconds since which each rule that is fulfilled now has been fulfilled.
+
+    A rule is fulfilled when its conditions held in the last samples, as many in a row as it needs.
 
     Args:
-        samples: Whole periods, as many as the longest rule needs, and one more.
+        samples: Measurements of whole periods: as many as the longest rule needs, and one more.
         settings: As for `decide`.
         now_s: As for `decide`.
         compress: As for `decide`.
-        before: What this returned a period ago; None at the first call.
+        before: The result of the call one period ago, for rules that have held for longer than *samples*
+            reach back; None at the first call.
     """
     period_s = cadence_of(settings).period_s / compress
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
-    return _find_starts(by_period, _periods(now_s, period_s), settings, period_s, before or {})
+    return _find_starts(by_period, _count_periods(now_s, period_s), settings, period_s, before or {})
 
 
 def _find_starts(
@@ -131,7 +146,11 @@ def _find_starts(
     period_s: float,
     before: Mapping[str, float],
 ) -> dict[str, float]:
-    """Return since when each rule holds; a run as long as the history began when *before* says."""
+    """Compute `find_rule_starts` from samples by number of their period, of which *ended* have ended.
+
+    If the conditions of a rule hold in all samples, the rule may have held longer: then the earlier time in
+    *before* counts.
+    """
     starts_s, oldest = {}, min(by_period, default=ended)
     for rule in rules_of(settings):
         first = ended
@@ -168,7 +187,7 @@ def _scale(
     return Action(kind="stay", reason=f"{reason}, at scaling.min_servers")
 
 
-def _periods(now_s: float, period_s: float) -> int:
-    """Return how many periods have ended by *now_s*."""
-    # The small term guards against a start that is a rounding error below its multiple.
+def _count_periods(now_s: float, period_s: float) -> int:
+    """Return the number of periods of *period_s* that have ended by *now_s*."""
+    # The small term corrects times that a rounding error puts just below a multiple of the period.
     return math.floor(now_s / period_s + 1e-6)

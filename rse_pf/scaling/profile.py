@@ -1,7 +1,7 @@
-"""The period of a sample and the number of samples of each rule, in both profiles.
+"""The period of a sample, and the number of samples in a row that each rule needs, in both profiles.
 
-The paper's profile takes ``scaling.period_s`` and `BUSY_PERIODS`; the fast one takes three samples
-of 10 s.  How long a fleet must be idle is the same in both.
+The paper's profile uses ``scaling.period_s`` and `BUSY_PERIODS`; the fast profile grows after three samples
+of 10 s.  The time for which a fleet must be idle before it shrinks is the same in both profiles.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from rse_pf.config.elasticity import FAST_PERIOD_S, FAST_SAMPLES
 
 __all__ = ["REPEAT_S", "Cadence", "cadence_of"]
 
-# Seconds after which a rule that still holds acts again: an alarm repeats a scaling action once a minute,
-# whatever its period is (AWS, "Using Amazon CloudWatch alarms").
+# Seconds after which a rule that still holds acts again: CloudWatch repeats the scaling action of an alarm
+# once a minute, whatever the alarm's period is (AWS, "Using Amazon CloudWatch alarms").
 REPEAT_S = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cadence:
-    """The period of a sample, in seconds, and numbers of samples in a row.
+    """The period of a sample, and the number of samples in a row after which a rule acts.
 
     Attributes:
-        period_s: One sample.
-        busy: Before the platform grows.
-        idle: Without any work, before it shrinks.
-        underused: With little work, before it shrinks; 0 is never.
-        repeat: Between two actions of a rule that holds all the time.
-        is_fast: Whether the servers publish these samples themselves.
+        period_s: Length of a sample in seconds.
+        busy: Number of busy or crowded samples before the platform grows.
+        idle: Number of samples without any request before it shrinks.
+        underused: Number of samples with little work before it shrinks; 0: it never shrinks for this reason.
+        repeat: Number of samples between two actions of a rule that goes on holding.
+        is_fast: Whether the profile is ``fast``, in which the servers publish their CPU themselves.
     """
 
     period_s: int
@@ -41,16 +41,17 @@ class Cadence:
 
     @property
     def most(self) -> int:
-        """Return the largest number of samples that a rule needs."""
+        """Return the largest number of samples in a row that any rule needs."""
         return max(self.busy, self.idle, self.underused)
 
 
-# Busy samples in a row before the paper's profile grows: a load of one minute ends before a server starts.
+# Number of busy samples in a row before the platform grows in the paper's profile: a load of one period ends
+# before a new server has started.
 BUSY_PERIODS = 2
 
 
 def cadence_of(settings: ScalingSettings) -> Cadence:
-    """Return the cadence of ``scaling.profile``."""
+    """Return the cadence of the profile that ``scaling.profile`` names."""
     is_fast = settings.profile == "fast"
     period_s = FAST_PERIOD_S if is_fast else settings.period_s
     return Cadence(

@@ -1,8 +1,8 @@
 """Decide how many robots a crowded server moves to others, so that all servers have about the same number.
 
-`moves` is for a caller that has the numbers of every server, such as the local control plane; `share` is the
-same rule for one server that has only the totals, as on AWS.  No robot moves while all servers are within the
-margin, and no more robots move than necessary.
+`moves` is for a caller that knows the number of robots of every server, such as the local control plane;
+`share` is the same rule for one server that knows only the totals, as on AWS.  No robot moves while the
+numbers of all servers are within `MARGIN` of their mean, and no more robots move than necessary.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from rse_pf.config.elasticity import MOVES_PER_S
 
 __all__ = ["MARGIN", "MAX_PAUSE_S", "MoveOrder", "Totals", "moves", "pause_after_s", "plan_order", "share"]
 
-# Robots move until all servers are within this share of the mean: moving more gains little.
+# Robots move only while a server's number differs from the mean by more than this fraction.
 MARGIN = 0.2
-# Longest pause of a server whose robots do not move, in seconds.
+# Longest pause in seconds between two orders of a server whose robots do not move.
 MAX_PAUSE_S = 600.0
-# No robot moves while their total changes by more than this share from one period to the next.
-_STEADY_SHARE = 0.1
+# No robot moves while the number of all robots changes by more than this fraction between two periods.
+_STEADY_FRACTION = 0.1
 
 
 def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
-    """Return how many robots each crowded server has to move; empty if none has to.
+    """Return how many robots each crowded server has to move, by its name; empty if none has to.
 
-    Even is ``total / servers``.  When the robots that move land on the least crowded servers, all end within
-    *margin* of even, or at the whole numbers around even where the margin holds none.
+    If the robots that move connect to the least crowded servers, every server then has a number within
+    *margin* of the mean ``total / servers``, or a neighbouring whole number if none is within the margin.
 
     Args:
         robots: Number of robots of each server that takes part, by name; not negative.
-        margin: A share of even.
+        margin: Allowed deviation, as a fraction of the mean.
     """
     if len(robots) < 2:
         return {}
@@ -52,14 +52,15 @@ def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
 def share(mine: int, total: int, servers: int, margin: float = MARGIN) -> int:
     """Return how many of its *mine* robots one server has to move, knowing only the totals.
 
-    It must assume that all other servers but one are as crowded as itself, and that this one lacks what the
-    others have in excess; the margin is therefore divided among them.  For two servers this equals `moves`.
+    In the worst case all other servers but one are as crowded as this server, and the last one lacks the
+    robots that they have in excess.  The margin of a server is therefore *margin* divided by ``servers - 1``.
+    For two servers the result equals that of `moves`.
 
     Args:
         mine: Number of robots of this server.
-        total: Robots of all servers, this one included.
-        servers: Number of servers that take part, this one included.
-        margin: A share of even.
+        total: Number of robots of all servers, this server included.
+        servers: Number of servers that take part, this server included.
+        margin: Allowed deviation, as a fraction of the mean.
     """
     if servers < 2:
         return 0
@@ -76,7 +77,7 @@ def _lowest_share(total: int, servers: int, margin: float) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Totals:
-    """Robots of all servers, and the number of servers, in the period that began at ``start_s``."""
+    """The number of robots of all servers, and of servers, in the period that began at ``start_s`` (s)."""
 
     start_s: float
     robots: int
@@ -85,21 +86,22 @@ class Totals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MoveOrder:
-    """Let *robots* robots move, spread over *spread_s*."""
+    """An order to a server: ask *robots* of its robots to move, spread over *spread_s* seconds."""
 
     robots: int
     spread_s: float
 
 
 def plan_order(mine: int, totals: Sequence[Totals]) -> MoveOrder | None:
-    """Return what a server with *mine* robots orders; None if nothing, or if the sums still change.
+    """Return the order that moves the surplus of a server with *mine* robots.
 
-    A server that is above its share goes down to even, not to the border of the margin: some load balancers
-    send a part of the robots back, and no server can get more than it lacks while all go down to even.
+    None if the server is within its margin, or while the totals are missing or still change.  A server above
+    its margin goes down to the mean, not only to the margin: some load balancers send a part of the robots
+    back, and while all crowded servers go down to the mean, no other server gets more robots than it lacks.
 
     Args:
-        mine: Robots of this server now.
-        totals: Of whole periods, the newest first.
+        mine: Number of robots of this server now.
+        totals: Totals of whole periods, the newest first.
     """
     if len(totals) < 2 or not _is_steady(totals[0], totals[1]):
         return None
@@ -111,17 +113,18 @@ def plan_order(mine: int, totals: Sequence[Totals]) -> MoveOrder | None:
 
 
 def pause_after_s(order: MoveOrder, *, within_s: float, failures: int) -> float:
-    """Return how long a server asks nobody after *order*.
+    """Return how long, in seconds, a server gives no further order after *order*; at most `MAX_PAUSE_S`.
 
     Args:
-        order: The last one.
-        within_s: Time that a robot gets to move.
-        failures: Orders before it, in a row, after which the server had no robot less: such robots cannot
-            move, or the load balancer sends them back, and the pause doubles.
+        order: The server's last order.
+        within_s: Time that a robot has for its move, in seconds.
+        failures: Number of orders in a row before it that failed, because the server had no fewer robots at
+            the next order: its robots cannot move, or the load balancer sends them back.  Each doubles the
+            pause.
     """
     return min((order.spread_s + within_s) * 2.0**failures, MAX_PAUSE_S)
 
 
 def _is_steady(newest: Totals, before: Totals) -> bool:
     changed = abs(newest.robots - before.robots)
-    return newest.servers == before.servers and changed <= max(2.0, _STEADY_SHARE * newest.robots)
+    return newest.servers == before.servers and changed <= max(2.0, _STEADY_FRACTION * newest.robots)

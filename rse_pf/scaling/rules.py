@@ -1,4 +1,4 @@
-"""The rules of scaling as one table: what is compared, for how many samples in a row, and what then changes.
+"""The rules of scaling as one table: conditions, for how many samples in a row, and by how many servers.
 
 `rse_pf.scaling.policy` applies the table on one machine, and `rse_pf.scaling.alarms` translates it into
 CloudWatch alarms.  A rule that adds servers has one condition; a rule that removes one may have several.
@@ -17,16 +17,16 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["BIG_STEP", "STEP", "Condition", "Field", "Sample", "ScalingRule", "ScalingStep", "rules_of"]
 
-# Servers added above `scaling.busy_cpu_percent`: the least change, as in the paper.
+# Number of servers that a rule adds or removes at a time, as in the paper.
 STEP = 1
-# Servers added above `scaling.very_busy_cpu_percent`: one would be busy again after its warm-up.
+# Number of servers added above `scaling.very_busy_cpu_percent`: one server more would soon be busy again.
 BIG_STEP = 2
-# Share of `scaling.max_robots_per_server` below which a server may be removed although robots send commands:
-# when one of two servers leaves, the other one gets twice as many robots.
-_SPARE_SHARE = 0.5
+# Fraction of `scaling.max_robots_per_server` below which a server may be removed although robots send
+# commands: when one of two servers is removed, the other one gets twice as many robots.
+_SPARE_FRACTION = 0.5
 
 Field = Literal["cpu_percent", "requests", "robots_per_server"]
-"""A field of a `Sample` that a rule may compare."""
+"""Name of a field of `Sample` that a condition may compare."""
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {
     ">=": operator.ge, "<": operator.lt, "==": operator.eq,
 }  # fmt: skip
@@ -36,7 +36,11 @@ _OPERATORS: dict[str, Callable[[float, float], bool]] = {
 class Sample:
     """Measurements of one whole period, over all servers that are past their warm-up.
 
-    ``start_s`` is the start of the period, so a sample covers ``[start_s, start_s + period)``.
+    Attributes:
+        start_s: Start of the period in seconds; the sample covers ``[start_s, start_s + period)``.
+        cpu_percent: Mean CPU utilisation of the servers.
+        requests: Number of requests to all servers in the period.
+        robots_per_server: Mean number of robots of a server.
     """
 
     start_s: float
@@ -60,7 +64,10 @@ class Condition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScalingStep:
-    """How many servers to add while a value is in ``[lower, upper)`` above its limit; None: no bound."""
+    """The change of the number of servers while a value lies *lower* to *upper* above the rule's limit.
+
+    *upper* is excluded; None means no bound; a negative change removes servers.
+    """
 
     lower: float | None
     upper: float | None
@@ -69,15 +76,15 @@ class ScalingStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScalingRule:
-    """Conditions on *samples* samples in a row, and by how many servers they change the fleet.
+    """Conditions that must hold in some samples in a row, and the change of the fleet that follows.
 
     Attributes:
-        name: Also the name of the alarm, and of its chapter in docs/operations.md.
-        meaning: For the description of the alarm.
+        name: Name of the rule, of its alarm, and of the alarm's chapter in docs/operations.md.
+        meaning: Text for the description of the alarm.
         conditions: All of them must hold.
-        samples: In a row.
-        steps: Changes by the distance of the first condition's field from its limit.
-        reason: For the log; fields of the newest `Sample` in braces.
+        samples: Number of samples in a row in which they must hold.
+        steps: Changes of the number of servers, by how far the first condition's field is above its limit.
+        reason: Text for the log, a format string with fields of the newest `Sample`.
     """
 
     name: str
@@ -97,17 +104,17 @@ class ScalingRule:
         return all(condition.holds(sample) for condition in self.conditions)
 
     def change(self, sample: Sample) -> int:
-        """Return the change of the number of servers for a *sample* that meets the conditions."""
+        """Return by how many servers the rule changes the fleet for a *sample* that meets its conditions."""
         above = getattr(sample, self.conditions[0].field) - self.conditions[0].limit
         return next(step.change for step in self.steps if step.upper is None or above < step.upper)
 
     def explain(self, sample: Sample) -> str:
-        """Return the reason, with the numbers of *sample*."""
+        """Return the text for the log, with the numbers of *sample*."""
         return self.reason.format(**asdict(sample))
 
 
 def rules_of(settings: ScalingSettings) -> tuple[ScalingRule, ...]:
-    """Return the rules that *settings* switch on, those that add servers first.
+    """Return the rules that *settings* enable; the rules that add servers come first.
 
     Source:
         RSE-PF paper, Sect. 6.2: busy above 70 % CPU, one server less after five idle minutes; Sect. 3.1: a
@@ -161,7 +168,7 @@ def rules_of(settings: ScalingSettings) -> tuple[ScalingRule, ...]:
                 meaning="one server fewer can do the work",
                 conditions=(
                     Condition(field="cpu_percent", comparison="<", limit=UNDERUSED_CPU_PERCENT),
-                    *_below_robots(_SPARE_SHARE * robots),
+                    *_below_robots(_SPARE_FRACTION * robots),
                 ),
                 samples=cadence.underused,
                 steps=(one_less,),
@@ -172,5 +179,5 @@ def rules_of(settings: ScalingSettings) -> tuple[ScalingRule, ...]:
 
 
 def _below_robots(limit: float) -> tuple[Condition, ...]:
-    """Return the condition on robots of a rule that removes a server; none without a limit on robots."""
+    """Return the condition that fewer than *limit* robots are on each server; none if the limit is 0."""
     return (Condition(field="robots_per_server", comparison="<", limit=limit),) if limit else ()
