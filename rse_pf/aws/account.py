@@ -14,14 +14,15 @@ from rse_pf.errors import ConfigurationError, MissingExtra
 __all__ = ["Account", "open_account"]
 
 _SIGN_IN = "set AWS_PROFILE, or sign in with aws sso login or aws configure"
-_ABSENT = (
+# Error codes by which AWS says that the resource of a call does not exist.
+_NOT_FOUND_CODES = (
     "ValidationError", "ResourceNotFoundException", "NoSuchResourceException", "ParameterNotFound",
     "NoSuchBucket", "NoSuchTagSet", "InvalidInstanceID.NotFound", "InvalidInstanceID.Malformed",
 )  # fmt: skip
 
 
 class Account:
-    """The clients of one region; each is made when it is first used."""
+    """The operator's account in one region; the client of a service is made when it is first used."""
 
     def __init__(self, region: str, make: Callable[[str, str], Any] = make_client) -> None:
         self.region = region
@@ -29,7 +30,7 @@ class Account:
         self._clients: dict[str, Any] = {}
 
     def client(self, service: str) -> Any:
-        """Return the client of a service; raises ConfigurationError when the region has no such service."""
+        """Return the boto3 client of *service*; raises ConfigurationError if the region does not have it."""
         from botocore.exceptions import BotoCoreError
 
         if service not in self._clients:
@@ -42,12 +43,12 @@ class Account:
         return self._clients[service]
 
     def find(self, service: str, method: str, **arguments: Any) -> dict[str, Any] | None:
-        """Return the answer of one call, or None when what it names does not exist.
+        """Call *method* of *service* and return the answer; None if the resource of the call does not exist.
 
         Raises:
-            ConfigurationError: AWS refused.  The error holds no argument and no text of AWS, which may
-                repeat an argument.
-            StoreError: AWS does not answer.
+            ConfigurationError: AWS refused.  The message holds neither the arguments nor AWS's text, which
+                may repeat an argument.
+            StoreError: AWS does not answer, also after retries.
         """
         from botocore.exceptions import ClientError
 
@@ -56,7 +57,7 @@ class Account:
             answer: dict[str, Any] = with_retries(lambda: call(**arguments))
         except ClientError as error:
             code = error_code(error)
-            if code in _ABSENT:
+            if code in _NOT_FOUND_CODES:
                 return None
             raise ConfigurationError(
                 f"AWS refuses {service} {method}: {code}",
@@ -65,22 +66,25 @@ class Account:
         return answer
 
     def change(self, service: str, method: str, **arguments: Any) -> dict[str, Any]:
-        """Return the answer of one call that changes something which must exist.
+        """Call *method* of *service*, whose resource must exist, and return the answer.
 
         Raises:
-            ConfigurationError: AWS refused, or what the call names does not exist.
-            StoreError: AWS does not answer.
+            ConfigurationError: AWS refused, or the resource of the call does not exist.
+            StoreError: AWS does not answer, also after retries.
         """
         answer = self.find(service, method, **arguments)
         if answer is None:
             raise ConfigurationError(
-                f"AWS refuses {service} {method}: it does not exist, or cannot be changed this way",
+                f"AWS refuses {service} {method}: the resource does not exist, or cannot be changed this way",
                 hint="rse-pf cloud status shows what exists; then repeat the command",
             )
         return answer
 
     def pages(self, service: str, method: str, rows: str, **arguments: Any) -> list[Any]:
-        """Return *rows* of every page of a call; none if what it names does not exist.  Raises as `find`."""
+        """Call *method* for all pages, and return the lists in the field *rows* of the answers joined.
+
+        The list is empty if the resource of the call does not exist.  Raises the errors of `find`.
+        """
         client = self.client(service)
         if not client.can_paginate(method):
             return list((self.find(service, method, **arguments) or {}).get(rows, ()))
@@ -94,7 +98,9 @@ class Account:
             arguments[token_in] = page[token_out]
 
     def resource(self, stack: str, kind: str, prefix: str) -> str:
-        """Return the physical id of a stack's resource; its logical id begins with *prefix*.
+        """Return the physical id of a resource of *stack*.
+
+        Its type is *kind*, such as ``AWS::S3::Bucket``, and its logical id begins with *prefix*.
 
         Raises:
             ConfigurationError: There is no such stack or resource, or AWS refused.
@@ -111,11 +117,11 @@ class Account:
 
 
 def open_account(region: str) -> Account:
-    """Return the account whose credentials boto3 finds.
+    """Return the account whose credentials boto3 finds, for *region*; no call to AWS is made.
 
     Raises:
         MissingExtra: boto3 is not installed.
-        ConfigurationError: There are no credentials, or they are broken.
+        ConfigurationError: There are no credentials, or they cannot be read.
     """
     try:
         import boto3
@@ -132,7 +138,7 @@ def open_account(region: str) -> Account:
 
 
 def _page_tokens(paginator: Any) -> tuple[str, str]:
-    """Return the names of a call's page token, as an argument and in the answer."""
-    config = paginator._pagination_cfg  # botocore has no public name for them
+    """Return the name of a call's page token among its arguments, and its name in the answer."""
+    config = paginator._pagination_cfg  # botocore has no public attribute with these names
     into, out = config["input_token"], config["output_token"]
     return (into, out) if isinstance(into, str) else (into[0], out[0])

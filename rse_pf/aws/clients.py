@@ -1,7 +1,8 @@
 """Make AWS clients with short timeouts, and retry their calls within a bounded time.
 
-A call is attempted at most three times, and no attempt begins that could end later than ten seconds after the
-first began.  Only errors that may be temporary are retried: lost connections, throttling, failing services.
+A call is attempted at most `MAX_TRIES` times, and no attempt begins that could end later than `MAX_S` seconds
+after the first one began.  Only errors that may be temporary are retried: lost connections, throttling, and
+errors of the service (5xx).
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ __all__ = [
     "with_retries",
 ]
 
-# Attempts of one call: two failures in a row are rare unless AWS itself is unavailable.
+# Most attempts of one call: two failures in a row are rare unless AWS itself is unavailable.
 MAX_TRIES = 3
-# No attempt begins that could end later than this after the first one, in seconds: callers have deadlines.
+# Seconds from the begin of the first attempt until the last one must have ended: callers have deadlines.
 MAX_S = 10.0
-# Time limit of a connection, in seconds: within a region a handshake takes milliseconds.
+# Time limit of opening a connection, in seconds: within a region a handshake takes milliseconds.
 _CONNECT_S = 1.0
-# Time limit of an answer, in seconds: with the connections and pauses, two attempts fit into `MAX_S`.
+# Time limit of waiting for data of an answer, in seconds: two slow attempts with a pause fit into `MAX_S`.
 _READ_S = 3.5
-# Pause before the second attempt, in seconds; the next one is twice as long.
+# Pause before the second attempt of a call, in seconds; each further pause is twice as long.
 FIRST_PAUSE_S = 0.1
-# HTTP status: too many requests.
+# HTTP status "too many requests".
 _THROTTLED = 429
-# Error codes of AWS that allow a retry.  Most come with status 400, the last two with 409: S3 stored nothing
-# because another write of the same name was in progress, and that write may fail.
+# Error codes of AWS after which a call is retried.  Most come with status 400, the last two with 409: S3
+# stored nothing because another write of the same name was in progress, and that write may fail.
 _TEMPORARY = frozenset(
     {
         "Throttling", "ThrottlingException", "ThrottledException", "RequestThrottled",
@@ -54,7 +55,10 @@ T = TypeVar("T")
 
 
 def make_client(service: str, region: str) -> Any:
-    """Return a client of botocore without retries of its own; raises MissingExtra."""
+    """Return a botocore client with short timeouts and without retries; raises MissingExtra.
+
+    Retries are made by `with_retries` instead.
+    """
     try:
         import botocore.session
         from botocore.config import Config
@@ -73,14 +77,17 @@ def make_client(service: str, region: str) -> Any:
 
 
 def _addressing() -> str:
-    """Return where the address names a bucket: in the host, or in the path of an emulator's address."""
+    """Return where a URL of S3 names the bucket: ``virtual``, in the host, or ``path`` with an emulator."""
     is_emulated = any(os.environ.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"))
     return "path" if is_emulated else "virtual"
 
 
 @functools.cache
 def _loader() -> Any:
-    """Return the API descriptions that all clients share: each takes 10 MB and 0.1 s to read."""
+    """Return the loader of API descriptions that all clients share.
+
+    A loader for each client would take 10 MB and 0.1 s.
+    """
     from botocore.loaders import create_loader
 
     return create_loader()
@@ -92,11 +99,11 @@ def with_retries(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> T:
-    """Return what *call* returns, after at most `MAX_TRIES` attempts within `MAX_S` seconds.
+    """Return the result of *call*; retry temporary errors, at most `MAX_TRIES` attempts in `MAX_S` seconds.
 
     Raises:
-        ClientError: AWS refused; `status_of` and `error_code` say how.
-        StoreError: AWS could not be reached.
+        ClientError: AWS refused, and a retry would not help; see `status_of` and `error_code`.
+        StoreError: AWS could not be reached, or the error was temporary until the last attempt.
     """
     from botocore.exceptions import BotoCoreError, ClientError
 
@@ -119,7 +126,7 @@ def with_retries(
 
 
 def _describe_error(error: Any) -> str:
-    """Return *error* on one line, without the page of HTML that a proxy or a load balancer may have sent."""
+    """Return *error* as one line; of an HTML page, which a proxy may have sent, only the HTTP status."""
     text = str(error)
     if "<" not in text and "\n" not in text:
         return text
@@ -128,7 +135,12 @@ def _describe_error(error: Any) -> str:
 
 
 def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
-    """Return the answer of one call with retries; raises StoreError, or ConfigurationError when refused."""
+    """Call *method* of *client* with retries and return the answer.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
     from botocore.exceptions import ClientError
 
     try:
@@ -141,12 +153,15 @@ def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
 
 
 def status_of(error: Any) -> int:
-    """Return the HTTP status of a ClientError; 0 when it has none."""
+    """Return the HTTP status of a ClientError of botocore; 0 if it has none."""
     return int(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
 
 
 def error_code(error: Any) -> str:
-    """Return the AWS error code of a ClientError, such as ``AccessDenied``; empty when it has none."""
+    """Return the AWS error code of a ClientError, such as ``AccessDenied``; empty if it has none.
+
+    If the answer was an HTML page, return its HTTP status as text.
+    """
     code = str(error.response.get("Error", {}).get("Code", ""))
     return f"HTTP status {status_of(error)}" if "<" in code else code
 

@@ -1,4 +1,5 @@
-"""The canary of a deployment: a function that asks for one known pose through the load balancer each minute.
+"""The canary of a deployment: an AWS Lambda function that requests one known pose each minute.
 
-The handler belongs here; its schedule and its alarm are in the stacks.
+It connects through the load balancer, as a robot does.  The handler belongs here; its schedule and its alarm
+are in the stacks.
 """

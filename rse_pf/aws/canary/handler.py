@@ -1,8 +1,9 @@
-"""The canary: ask for one known pose through the load balancer, as a robot does, and fail if it is not right.
+"""The canary: request one known pose through the load balancer, as a robot does, and fail if it is wrong.
 
-A schedule calls it each minute.  It is an enrolled robot with a key of its own in a secret that only it may
-read, and with the scope services:pnp; it can sign nothing for another robot.  A failed execution is a data
-point of the function's metric Errors, which the alarm `canary` reads; one log line says what failed.
+A schedule calls the function each minute.  The canary is an enrolled robot with the scope services:pnp; its
+private key is in a secret that only this function may read, so that it can sign tokens for no other robot.
+Each failed execution counts in the function's metric Errors, which the alarm ``canary`` reads, and one log
+line says what failed.
 """
 
 from __future__ import annotations
@@ -37,27 +38,30 @@ from rse_pf.wire.messages import Failure
 __all__ = ["ask_known_pose", "handler", "read_key"]
 
 _ROOT = Path(__file__).resolve().parents[3]
-_CODEC = "zlib"
-# Time limit of the connection, the handshake and the answer together, in seconds.
+_CODEC = "zlib"  # the codec that robots use by default
+# Seconds from the begin of the connection until the answer must have arrived.
 _TIMEOUT_S = 10.0
-# Time limit of the closing handshake, in seconds; the answer has been received before.
-_CLOSE_S = 1.0
-_HINT = "look at the load balancer's target groups and the servers' journals"
-# Seed of the problem: the same in every call, so that its answers can be compared.
+# Time limit of the closing handshake in seconds: short, because the answer has been received before.
+_CLOSE_TIMEOUT_S = 1.0
+_HINT = "check the load balancer's target groups, and read the servers' journals"
+# Seed of the PnP problem: the same in every call, so that the answers can be compared.
 _SEED = 20260101
-# Largest error of an element of the pose; the error of this problem is 0.001.
-_MAX_ERROR = 0.02
+# Largest allowed difference of an element of the 4x4 pose from the true one; a right solver is within 0.001.
+_MAX_POSE_ERROR = 0.02
 _KEYS: dict[str, SigningKey] = {}
-"""The canary's key by secret; it is read once in each execution environment."""
+"""The canary's private key by the ARN of its secret, kept between calls until a call fails."""
 
 
 def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
-    """Ask once; raises RsePfError, so that Lambda counts an error, if there was no right pose in time."""
+    """Request the known pose once, and return server, round-trip time (ms) and error of the pose.
+
+    Raises RsePfError if no right pose came in time, so that Lambda counts an error of the function.
+    """
     settings, trace = load_settings(_ROOT / "settings.json"), secrets.token_hex(16)
     try:
         outcome = _ask(os.environ, settings, trace)
     except RsePfError as error:
-        _KEYS.clear()  # the key may have been replaced
+        _KEYS.clear()  # the operator may have replaced the key, so the next call reads it again
         _log(event="canary-failed", trace=trace, code=error.code, error=error.message[:200])
         raise
     _log(event="canary-solved", trace=trace, **outcome)
@@ -65,7 +69,7 @@ def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
 
 
 def read_key(secret: str, region: str) -> SigningKey:
-    """Return the private key of the canary's robot from the secret; raises RsePfError."""
+    """Return the private key of the canary's robot, which the secret *secret* holds; raises RsePfError."""
     secret_value = call_api(make_client("secretsmanager", region), "get_secret_value", SecretId=secret)
     return SigningKey.from_json(str(secret_value["SecretString"]))
 
@@ -73,17 +77,20 @@ def read_key(secret: str, region: str) -> SigningKey:
 def ask_known_pose(
     url: str, token: str, settings: PlatformSettings, *, trace: str, clock: Callable[[], float]
 ) -> dict[str, Any]:
-    """Ask for the pose of one seeded problem at *url*; return server, round-trip time in ms, and error.
+    """Request the pose of one seeded PnP problem from the platform at *url*, and check the answer.
+
+    Returns ``server`` (the id of the server), ``took_ms`` (from the begin of the connection to the answer)
+    and ``error`` (the largest difference of an element of the pose from the true one).
 
     Args:
-        url: Of the load balancer, such as ``wss://robots.example.org/ws``.
-        token: Of the canary's robot.
+        url: Address of the load balancer, such as ``wss://robots.example.org/ws``.
+        token: Token of the canary's robot.
         settings: Limits of the session.
         trace: Trace id, which the server logs with the command.
         clock: Monotonic seconds.
 
     Raises:
-        RsePfError: No server answers, it refuses, the answer is late, or the pose is wrong.
+        RsePfError: No server answers, the server refuses, the answer is late, or the pose is wrong.
     """
     problem = make_problem(seed=_SEED, noise_px=0.5, outlier_ratio=0.3)
     codec = make_codec(_CODEC, settings.session)
@@ -94,17 +101,17 @@ def ask_known_pose(
     address = urlsplit(url)
     host, port = address.hostname or "", address.port or (443 if address.scheme == "wss" else 80)
     try:
-        # With a socket of its own the library follows no redirect; robots follow none either.
+        # With a socket from its caller the library follows no redirects; robots follow none either.
         stream = socket.create_connection((host, port), timeout=_TIMEOUT_S)
         with connect(
             url, sock=stream, subprotocols=[Subprotocol(SUBPROTOCOLS[_CODEC])], compression=None,
             additional_headers={"Authorization": f"Bearer {token}"}, open_timeout=_TIMEOUT_S,
-            ping_interval=None, close_timeout=_CLOSE_S, max_size=settings.session.max_message_bytes,
+            ping_interval=None, close_timeout=_CLOSE_TIMEOUT_S, max_size=settings.session.max_message_bytes,
         ) as websocket:  # fmt: skip
             answered = _exchange(session, websocket, clock, until_s=began + _TIMEOUT_S)
     except InvalidStatus as error:
         body = error.response.body[:200].decode("utf-8", "replace")
-        raise ConnectError(f"the handshake: {error}: {body}", hint=_HINT) from error
+        raise ConnectError(f"the handshake failed: {error}: {body}", hint=_HINT) from error
     except ConnectionClosed as error:
         raise ConnectError(f"the server left: {error}", hint=_HINT) from error
     except (OSError, ValueError, WebSocketException) as error:
@@ -115,7 +122,12 @@ def ask_known_pose(
 def _exchange(
     session: ClientSession, websocket: ClientConnection, clock: Callable[[], float], until_s: float
 ) -> Answered:
-    """Send what the session wants to send until its command is answered."""
+    """Exchange messages over *websocket* until the session's command is answered; return the answer.
+
+    Raises:
+        Expired: There was no answer before *until_s* on *clock*.
+        InternalError: The session failed, or the server sent a notice.
+    """
     connection = session.open_connection(clock())
     while True:
         while connection.outgoing:
@@ -139,9 +151,9 @@ def _check_answer(event: Answered, expected: Any, took_ms: float) -> dict[str, A
         raise InternalError(f"{answer.server} answered {answer.code}: {answer.message}", hint=answer.hint)
     pose = as_type(answer.reply, pnp.PnpReply).solution().T_camera_world
     error = float(np.abs(pose - expected).max())
-    if not error < _MAX_ERROR:
+    if not error < _MAX_POSE_ERROR:
         raise InternalError(
-            f"the pose of {answer.server} is wrong by {error:.3g}, more than {_MAX_ERROR:g}",
+            f"the pose of {answer.server} is wrong by {error:.3g}, more than {_MAX_POSE_ERROR:g}",
             hint="compare the release of the servers with the last good one",
         )
     return {"server": answer.server, "took_ms": round(took_ms, 1), "error": round(error, 6)}

@@ -1,4 +1,4 @@
-"""The Auto Scaling group and its instances: the agent, the lifecycle hook, metrics.
+"""The Auto Scaling group and its instances: the agent, lifecycle hooks, metrics, logs and upgrades.
 
-Everything about running servers belongs here; objects and secrets belong to `storage`.
+Everything about running servers belongs here; objects and secrets belong to `rse_pf.aws.storage`.
 """

@@ -3,9 +3,10 @@
     python -m rse_pf.aws.fleet.agent --settings FILE --bucket B --keys-file FILE --state FOLDER
         --group G --hook H
 
-Without the agent the idle alarm never fires, and a scale-in disconnects robots.  A task that fails writes one
-line to the log and is repeated; the other tasks continue.  The agent writes public keys, roster and deny
-list; the only secret it writes is the token of the control port, which never leaves the machine.
+Without the agent no metrics are published, so that the idle alarm never fires, and a server that is removed
+disconnects its robots without a drain.  A task that fails writes one line to the log and is called again
+after its period; the other tasks continue.  The agent writes public keys, roster and deny list to files; the
+only secret that it writes is the token of the control port, which never leaves the machine.
 """
 
 from __future__ import annotations
@@ -57,24 +58,27 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
     services.task,
     store_errors.task,
 )
-"""The table, in the order of a step: one row and one module for each task."""
+"""The functions that make the tasks, one module each, in the order in which a step runs the tasks."""
 
-# Time between two steps, in seconds: the shortest period of a task without a thread of its own.
+# Time between two steps of the agent, in seconds: the shortest period of a task without a thread of its own.
 _STEP_S = 1.0
-# File whose existence says that keys and access control were fetched since the machine booted.
-_FETCHED = "fetched"
+# Name of the file that exists if keys, roster and deny list were fetched since the machine booted.
+_FETCHED_FILE = "fetched"
 
 SERVICES = ("autoscaling", "cloudwatch")
 """The AWS services whose clients the tasks use, in addition to S3."""
 
 
 class Agent:
-    """The tasks of one instance; `step` runs those that are due and is called repeatedly."""
+    """The tasks of one instance.
+
+    `step`, which the main loop calls every second, runs the tasks that are due; some have threads instead.
+    """
 
     def __init__(
         self, context: AgentContext, tasks: tuple[Callable[[AgentContext], Task], ...] = TASKS
     ) -> None:
-        """Make the *tasks* of *context*; none of them runs yet."""
+        """Make each task by calling its function in *tasks* with *context*; no task runs yet."""
         self._context = context
         self._tasks = {task.name: task for task in (make(context) for make in tasks)}
         self._due_s = dict.fromkeys(self._tasks, float("-inf"))
@@ -82,11 +86,11 @@ class Agent:
 
     @property
     def has_left(self) -> bool:
-        """Whether the instance has drained and completed its hook."""
+        """Whether the server has drained and the termination hook is completed."""
         return self._context.state.phase is Phase.LEFT
 
     def step(self) -> None:
-        """Run each task that is due in this phase of the instance."""
+        """Run each task without a thread of its own whose period has passed and that runs in this phase."""
         for task in self._tasks.values():
             now_s = self._context.clock()
             if not task.in_thread and self._may_run(task) and now_s >= self._due_s[task.name]:
@@ -94,15 +98,15 @@ class Agent:
                 self._try_task(task)
 
     def run(self, name: str) -> None:
-        """Run the task *name* once; raises what it raises."""
+        """Run the task *name* once, and raise its errors."""
         self._tasks[name].call()
 
     def attempt(self, name: str) -> None:
-        """Run the task *name* once; a failure is logged."""
+        """Run the task *name* once, and log an error instead of raising it."""
         self._try_task(self._tasks[name])
 
     def repeat(self, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
-        """Run the task *name* for ever, in a thread of its own."""
+        """Run the task *name* once in each of its periods, for ever; called in a thread of its own."""
         task = self._tasks[name]
         while True:
             if self._may_run(task):
@@ -110,7 +114,7 @@ class Agent:
             sleep(task.period_s)
 
     def start_threads(self) -> None:
-        """Start a thread for each task with ``in_thread``."""
+        """Start a thread that repeats the task, for each task with ``in_thread``."""
         for task in self._tasks.values():
             if task.in_thread:
                 threading.Thread(target=self.repeat, args=(task.name,), daemon=True).start()
@@ -133,7 +137,10 @@ class Agent:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run until a signal ends the process; ``--once`` only makes the token and fetches the keys."""
+    """Run the agent until a signal kills the process; return 2 after an error at the start.
+
+    With ``--once`` make the control token, fetch keys, roster, deny list and services, and return 0.
+    """
     parser = argparse.ArgumentParser(prog="rse-pf-agent", description="agent of a backend server on AWS")
     parser.add_argument("--settings", type=Path, required=True, metavar="FILE")
     for name in ("bucket", "keys-name", "group", "hook"):
@@ -161,8 +168,8 @@ def main(arguments: list[str] | None = None) -> int:
         context = _context(args)
         agent = Agent(context)
         if args.once:
-            _fetch(agent, args.keys_file.with_name(_FETCHED))
-            agent.attempt("services")  # a server without them is better than none
+            _fetch(agent, args.keys_file.with_name(_FETCHED_FILE))
+            agent.attempt("services")  # a server without the published services is better than no server
             return 0
     except RsePfError as error:
         show_error(error)
@@ -174,14 +181,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fetch(agent: Agent, mark: Path) -> None:
-    """Fetch keys and access control before a start of the server; the file *mark* records a success.
+    """Fetch keys, roster and deny list before the server starts; create the file *mark* after a success.
 
-    A server that restarts while S3 does not answer uses what was fetched since the boot, as running servers
-    do.  Older files do not exist: a machine of the warm pool may have been off for weeks, and the folder of
-    the keys, which also holds *mark*, is empty after each boot.
+    If S3 does not answer when a server restarts, the files that were fetched since the boot are used, as in a
+    running server.  Files of an earlier boot are never used, because a machine of the warm pool may have been
+    off for weeks: the folder of the keys, which also holds *mark*, is empty after each boot.
 
     Raises:
-        RsePfError: They could not be fetched in this boot.
+        RsePfError: The objects could not be fetched, now or earlier since the boot.
     """
     try:
         agent.run("keys")

@@ -1,6 +1,6 @@
 """Read the state of the Auto Scaling group: its servers, their target health, alarms, and robots.
 
-Nothing is changed.  A number that no agent published is None, never zero.
+Nothing is changed.  A number of robots that no agent published is None, never zero.
 """
 
 from __future__ import annotations
@@ -17,13 +17,21 @@ from rse_pf.scaling.alarms import NAMESPACE
 
 __all__ = ["AutoScalingGroup", "Server", "read_group"]
 
-# A number of robots that is older than this many periods is unknown.
+# Number of periods after which a published number of robots counts as unknown.
 _FRESH_PERIODS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Server:
-    """One instance; ``targets`` is its health in each target group, ``robots`` is None if unknown."""
+    """One instance of the group.
+
+    Attributes:
+        name: Instance id.
+        zone: Availability zone.
+        state: Lifecycle state in the group, such as ``InService``.
+        targets: Its health in each target group of the load balancer; ``absent`` where it is no target.
+        robots: Number of connected robots; None if it is unknown.
+    """
 
     name: str
     zone: str
@@ -34,7 +42,10 @@ class Server:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutoScalingGroup:
-    """The state of the group for ``rse-pf cloud status``; ``reasons`` explain the states of alarms."""
+    """The state of the group, as ``rse-pf cloud status`` shows it.
+
+    *alarms* maps the name of each alarm to its state, *reasons* to CloudWatch's reason for that state.
+    """
 
     min_servers: int
     wanted_servers: int
@@ -46,12 +57,12 @@ class AutoScalingGroup:
 
     @property
     def robots(self) -> tuple[float, ...]:
-        """The robots of each server whose number is known."""
+        """The numbers of robots of those servers whose number is known."""
         return tuple(server.robots for server in self.servers if server.robots is not None)
 
     @property
     def is_healthy(self) -> bool:
-        """Whether as many servers as wanted are in service, and healthy in every target group."""
+        """Whether at least as many servers as wanted are in service and healthy in every target group."""
         healthy = [s for s in self.servers if s.state == "InService" and set(s.targets) == {"healthy"}]
         return len(healthy) >= self.wanted_servers
 
@@ -59,13 +70,14 @@ class AutoScalingGroup:
 def read_group(
     account: Account, settings: PlatformSettings, *, now: datetime, asks_robots: bool = True
 ) -> AutoScalingGroup:
-    """Return the state of the group at *now*, in UTC.
+    """Return the state of the group.
 
     Args:
-        account: Of the group.
-        settings: Of the platform.
-        now: In UTC.
-        asks_robots: Whether numbers of robots are read, too; AWS charges for them.
+        account: AWS account and region of the group.
+        settings: Settings of the platform.
+        now: The time in UTC.
+        asks_robots: Whether the numbers of robots are read from CloudWatch, which costs a fee; else they are
+            None.
 
     Raises:
         ConfigurationError: There is no group in the region, or AWS refused.
@@ -106,7 +118,7 @@ def read_group(
 
 
 def _read_target_health(account: Account, arn: str) -> dict[str, str]:
-    """Return the health of each instance in one target group."""
+    """Return the health of each instance in the target group *arn*, such as ``healthy``, by instance id."""
     rows = account.pages("elbv2", "describe_target_health", "TargetHealthDescriptions", TargetGroupArn=arn)
     return {row["Target"]["Id"]: row["TargetHealth"]["State"] for row in rows}
 
@@ -114,9 +126,10 @@ def _read_target_health(account: Account, arn: str) -> dict[str, str]:
 def _read_robots(
     account: Account, group: str, servers: list[str], period_s: int, now: datetime
 ) -> dict[str, float]:
-    """Return the newest value of each server within the last complete periods; unknown ones are left out.
+    """Return the newest number of robots of each server in the last `_FRESH_PERIODS` complete periods.
 
-    The current period is left out: some agents may not have published theirs yet.
+    Servers without a value are left out.  The current period is not read, because some agents may not have
+    published their number yet.
     """
     end = datetime.fromtimestamp(now.timestamp() // period_s * period_s, now.tzinfo)
     queries = [

@@ -1,6 +1,6 @@
-"""Query this EC2 instance (IMDSv2) and the control port of its backend server.
+"""Query the metadata of this EC2 instance (IMDSv2) and the control port of its backend server.
 
-Only link-local and loopback addresses are used, with short timeouts.
+Only link-local and loopback addresses are used, with a timeout of two seconds.
 """
 
 from __future__ import annotations
@@ -18,41 +18,44 @@ from rse_pf.errors import Disconnected, UsageError
 
 __all__ = ["INTERRUPTION", "IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
 
-# Target lifecycle state of an instance that serves.
+# Target lifecycle state of an instance that is to serve robots.
 IN_SERVICE = "InService"
-# Target lifecycle state of an instance that is removed.
+# Target lifecycle state of an instance that is to be removed from the group.
 TERMINATED = "Terminated"
-# Prefix of the target lifecycle states of a warm pool.
+# Prefix of the target lifecycle states of an instance that is to wait in the warm pool.
 WARMED = "Warmed:"
 
 INTERRUPTION = "interruption"
-"""The notice that a Spot instance is taken back within two minutes."""
+"""Result of `Instance.spot_notice` if AWS takes the Spot instance back within two minutes."""
 
-_STAT = Path("/proc/stat")
-_IMDS = "http://169.254.169.254/latest/"
-# Validity of a token for the instance metadata; each token is used at once.
+_PROC_STAT = Path("/proc/stat")
+_IMDS = "http://169.254.169.254/latest/"  # address of the instance metadata service
+# Validity in seconds of a token for the instance metadata (an HTTP header); each token is used at once.
 _TOKEN_TTL_S = "60"
-# Time limit of a request to this machine, in seconds.
+# Time limit of a request to the metadata or to a server of this machine, in seconds.
 _TIMEOUT_S = 2.0
 _NOT_FOUND = 404
 
 
 class Instance:
-    """This EC2 instance, with the control port of its backend server."""
+    """This EC2 instance: its metadata, its backend server's control port, and its data service."""
 
     def __init__(self, port: int, token_file: Path | None = None, data_port: int = 0) -> None:
-        """Make an instance whose server listens on *port* and expects the token in *token_file*, if any.
+        """Describe the ports of this instance; nothing is requested yet.
 
-        A data service listens on *data_port*, if that is not 0.
+        Args:
+            port: Control port of the backend server.
+            token_file: File with the token of the control port; None if it needs none.
+            data_port: Port of the data service; 0 if there is none.
         """
         self._base = f"http://127.0.0.1:{port}"
         self._token_file = token_file
         self._data_base = f"http://127.0.0.1:{data_port}/data" if data_port else ""
 
     def is_ready(self) -> bool:
-        """Return whether the server takes robots, and the data service, where there is one, answers.
+        """Return whether the backend server takes robots and the data service, if there is one, answers.
 
-        An instance that is never ready is ended, so the store, which all servers share, is not asked.
+        The store is not checked: all servers share it, and an instance that is never ready is terminated.
         """
         try:
             _ask(f"{self._base}{READY_PATH}", "GET", {})
@@ -66,7 +69,7 @@ class Instance:
         """Return whether the store of the data service answers within two seconds.
 
         Raises:
-            Disconnected: The data service itself does not answer, or there is none.
+            Disconnected: The data service itself does not answer, or this instance has none.
         """
         if not self._data_base:
             raise Disconnected("this instance has no data service")
@@ -78,18 +81,20 @@ class Instance:
         return True
 
     def page(self) -> str:
-        """Return the server's /metrics; raises Disconnected when no server runs."""
+        """Return the text of the server's page /metrics; raises Disconnected if no server runs."""
         return self._ask("/metrics", "GET")
 
     def drain(self, wait_s: float) -> None:
-        """Tell the server to drain after *wait_s*; raises Disconnected when no server runs."""
+        """Have the server drain after *wait_s* seconds; raises Disconnected if no server runs."""
         self._ask(f"/drain?wait={wait_s:g}", "POST")
 
     def move(self, robots: int, spread_s: float) -> int:
-        """Have the server ask *robots* of its robots to move within *spread_s*; return how many it asks.
+        """Have the server ask *robots* of its robots to move, spread over *spread_s* seconds.
+
+        Return the number of robots that the server asks.
 
         Raises:
-            Disconnected: No server runs, it drains, or the answer is not one of a backend server.
+            Disconnected: No server runs, the server drains, or the answer cannot be read.
         """
         text = self._ask(f"/move?robots={robots}&spread_s={spread_s:g}", "POST")
         try:
@@ -98,15 +103,15 @@ class Instance:
             raise Disconnected(f"the answer to /move is {text[:40]!r}") from error
 
     def reload_services(self) -> None:
-        """Have the server load the published services; raises Disconnected when no server runs."""
+        """Have the server load the published services; raises Disconnected if no server runs."""
         self._ask("/services", "POST")
 
     def cpu_times(self) -> tuple[float, float]:
-        """Return the busy time and the total time of the machine's processors, in ticks."""
-        return read_cpu_times(_STAT.read_text(encoding="ascii"))
+        """Return the busy time and the total time of the machine's processors since its boot, in ticks."""
+        return read_cpu_times(_PROC_STAT.read_text(encoding="ascii"))
 
     def spot_notice(self) -> str:
-        """Return `INTERRUPTION` if AWS takes this instance back, ``rebalance`` if it may, or nothing.
+        """Return `INTERRUPTION` if AWS takes this instance back, ``rebalance`` if it may do so soon, else "".
 
         Raises:
             Disconnected: The instance has no metadata.
@@ -120,16 +125,16 @@ class Instance:
         if self._token_file is not None:
             try:
                 headers["Authorization"] = bearer(read_control_token(self._token_file))
-            except UsageError as error:  # the token is made before the server starts, so no server runs
+            except UsageError as error:  # no token file: it is made before the server starts, so none runs
                 raise Disconnected(error.message) from error
         return _ask(f"{self._base}{target}", method, headers)
 
     def instance_id(self) -> str:
-        """Return the instance's id; raises Disconnected."""
+        """Return the id of this instance; raises Disconnected if the instance metadata do not answer."""
         return self._metadata("instance-id") or ""
 
     def target_state(self) -> str:
-        """Return the lifecycle state that the instance has or is on its way to; raises Disconnected."""
+        """Return the lifecycle state that Auto Scaling wants the instance to have; raises Disconnected."""
         return self._metadata("autoscaling/target-lifecycle-state") or IN_SERVICE
 
     def _metadata(self, path: str) -> str | None:

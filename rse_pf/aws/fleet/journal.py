@@ -1,7 +1,7 @@
-"""Read this machine's journal: the output of the server, the agent, the data service and the boot.
+"""Read this machine's systemd journal: the output of the servers, the agent and the boot.
 
-Entries come as systemd exports them in JSON, one a line, and become lines of text.  The cursor of the last
-entry says where the next reading begins.
+Entries come from journalctl as JSON, one a line, and become lines of text.  The next reading begins after
+systemd's cursor of the last entry.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ UNITS = (
     "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service",
     "rse-pf-rosbridge.service", "cloud-init.service", "cloud-final.service",
 )  # fmt: skip
-"""Units whose entries are read; the last two hold the output of first_boot.py and install.py."""
-# Size of one piece of a journal: it uploads in less than a second.
-_MAX_BYTES = 1 << 22
-_FIELDS = "_SYSTEMD_UNIT,UNIT,MESSAGE"
+"""systemd units whose entries are read; the last two hold the output of first_boot.py and install.py."""
+# Size at which a batch of lines ends, in bytes: a batch of this size uploads in less than a second.
+_MAX_BATCH_BYTES = 1 << 22
+_JOURNAL_FIELDS = "_SYSTEMD_UNIT,UNIT,MESSAGE"
 
 JournalReader = Callable[[str], Iterable[bytes]]
-"""Returns the entries after a cursor, as JSON lines; an empty cursor means the boot of the machine."""
+"""Returns the journal's entries after a cursor, as JSON lines; "" means all entries since the boot."""
 
 
 class _Entry(msgspec.Struct, frozen=True):
-    """One entry; a message that is no UTF-8 is exported as a list of its bytes."""
+    """One entry of the journal; journalctl exports a message that is not UTF-8 as a list of its bytes."""
 
     cursor: str = msgspec.field(name="__CURSOR")
     realtime_us: str = msgspec.field(name="__REALTIME_TIMESTAMP")
@@ -39,7 +39,10 @@ class _Entry(msgspec.Struct, frozen=True):
 
     @property
     def line(self) -> str:
-        """Return ``2026-11-23T04:00:00.123Z rse-pf message`` for one line of output."""
+        """Return the entry as a line of text: time in UTC, unit and message.
+
+        An example is ``2026-11-23T04:00:00.123Z rse-pf message``.
+        """
         at = datetime.fromtimestamp(int(self.realtime_us) / 1e6, timezone.utc)
         text = (
             bytes(self.message).decode("utf-8", "replace") if isinstance(self.message, list) else self.message
@@ -50,17 +53,17 @@ class _Entry(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Batch:
-    """Some lines of a journal in UTF-8, the Unix microseconds of the first, and the cursor of the last."""
+    """Lines of a journal as UTF-8 text, the time of the first (Unix microseconds), the cursor of the last."""
 
     first_us: int
     text: bytes
     cursor: str
 
 
-def make_batch(entries: Iterable[bytes], max_bytes: int = _MAX_BYTES) -> Batch | None:
-    """Return the first *entries* as one batch of about *max_bytes*; None if there are none.
+def make_batch(entries: Iterable[bytes], max_bytes: int = _MAX_BATCH_BYTES) -> Batch | None:
+    """Return the first *entries* as one batch, which ends with the line that reaches *max_bytes*.
 
-    An entry that cannot be read is left out; systemd writes none.
+    None if there are no entries.  An entry that cannot be decoded is left out.
     """
     first_us, cursor, size = 0, "", 0
     lines: list[bytes] = []
@@ -80,14 +83,20 @@ def make_batch(entries: Iterable[bytes], max_bytes: int = _MAX_BYTES) -> Batch |
 
 
 def journal_command(cursor: str) -> list[str]:
-    """Return the command that prints the entries of `UNITS` after *cursor*, or of this boot."""
-    command = ["/usr/bin/journalctl", "--output=json", f"--output-fields={_FIELDS}", "--no-pager", "--quiet"]
+    """Return the journalctl command that prints the entries of `UNITS` after *cursor*; "": since the boot."""
+    command = [
+        "/usr/bin/journalctl",
+        "--output=json",
+        f"--output-fields={_JOURNAL_FIELDS}",
+        "--no-pager",
+        "--quiet",
+    ]
     command += [f"--unit={unit}" for unit in UNITS]
     return command + ([f"--after-cursor={cursor}"] if cursor else ["--boot"])
 
 
 def read_journal(cursor: str) -> Iterator[bytes]:
-    """Yield the entries of `UNITS` after *cursor* on this machine; raises OSError."""
+    """Yield the entries of `UNITS` after *cursor* on this machine, as JSON lines; raises OSError."""
     with subprocess.Popen(
         journal_command(cursor), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as process:

@@ -1,6 +1,7 @@
-"""Decide when a new instance may join its group: it must answer its readiness checks within its budget.
+"""Decide when a new instance may join its group: its server must become ready within a time limit.
 
-The hook's default result is ABANDON, so a machine that does not report is replaced and never gets a robot.
+The launch hook's default result is ABANDON: a machine that does not complete the hook is replaced and never
+gets a robot.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _NOT_ACTIVE = "ValidationError"
 
 
 class LaunchAction(Enum):
-    """What an agent does with the launch hook."""
+    """What an agent does with the launch hook: wait, or complete it with CONTINUE or ABANDON."""
 
     WAIT = "WAIT"
     CONTINUE = "CONTINUE"
@@ -26,14 +27,19 @@ class LaunchAction(Enum):
 
 
 def launch_action(*, is_ready: bool, age_s: float, budget_s: float) -> LaunchAction:
-    """Return what to do *age_s* after the agent's start, of which *budget_s* are allowed."""
+    """Return what to do *age_s* seconds after the agent began to wait for the server, at most *budget_s*.
+
+    CONTINUE if the server is ready, ABANDON after *budget_s* seconds, else WAIT.
+    """
     if is_ready:
         return LaunchAction.CONTINUE
     return LaunchAction.WAIT if age_s < budget_s else LaunchAction.ABANDON
 
 
 def complete_hook(autoscaling: Any, *, group: str, hook: str, instance: str, result: str) -> bool:
-    """Complete *hook* with *result*; return False where it does not wait, or not yet.
+    """Complete the lifecycle hook *hook* of *instance* with *result* (``CONTINUE`` or ``ABANDON``).
+
+    Return False if the hook does not wait for this instance now, so that nothing was completed.
 
     Raises:
         ConfigurationError: AWS refused for another reason.

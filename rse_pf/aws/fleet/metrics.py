@@ -1,7 +1,8 @@
 """Convert a server's Prometheus page into the metrics that CloudWatch's alarms and dashboard read.
 
-Pure functions.  A counter that fell was reset by a restart and counts from zero again.  Metric names are
-those of `rse_pf.scaling.alarms` and `rse_pf.scaling.operator_alarms`; no robot's name is published.
+Pure functions.  A counter whose value fell was reset by a restart of the server and counts from zero again.
+Metric names are those of `rse_pf.scaling.alarms` and `rse_pf.scaling.operator_alarms`; names of robots are
+not published.
 """
 
 from __future__ import annotations
@@ -17,20 +18,22 @@ from rse_pf.scaling.operator_alarms import DISK_LOW, LOW_DISK_PERCENT, NATIVE_CR
 __all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_cpu_times", "read_page"]
 
 ROBOTS = "Robots"
-"""The only metric that is also published for each server."""
+"""Metric of the number of connected robots: the only one that is also published for each single server."""
 
 _LINE = re.compile(r"^rse_pf_(\w+?)(?:\{(.*)\})? (\S+)$", flags=re.M)
 _LABEL = re.compile(r'(\w+)="([^"]*)"')
-_INF = "+Inf"
-# An answer slower than the last bound counts as this many times that bound.
+_INF = "+Inf"  # the upper bound of the last bucket of a histogram in Prometheus' text format
+# An answer slower than the largest bound of the histogram is published as this many times that bound.
 _BEYOND_FACTOR = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerMetrics:
-    """One sample of a server: gauges as they are, counters since its start.
+    """One reading of a server's metrics page.
 
-    ``answers`` maps an upper bound in milliseconds to the number of answers that took at most that long.
+    ``requests``, ``bytes_in``, ``bytes_out``, ``worker_crashes`` and ``answers`` count since the server's
+    start; the others are current values.  ``answers`` is a cumulative histogram: it maps an upper bound in ms
+    to the number of answers that took at most that long.
     """
 
     robots: float = 0.0
@@ -45,7 +48,7 @@ class ServerMetrics:
 
 
 def read_page(text: str) -> ServerMetrics:
-    """Return the sample in a page of /metrics, in Prometheus' text format."""
+    """Return the metrics in the text of a /metrics page, which is in Prometheus' text format."""
     totals: Counter[str] = Counter()
     answers: Counter[float] = Counter()
     bounds_ms: list[float] = []
@@ -74,9 +77,9 @@ def read_page(text: str) -> ServerMetrics:
 
 
 def read_cpu_times(stat: str) -> tuple[float, float]:
-    """Return the busy time and the total time of the processors, in ticks, from /proc/stat.
+    """Return the busy time and the total time of the processors, in ticks, from the text of /proc/stat.
 
-    Time that the hypervisor took away counts as busy, as in CPUUtilization of EC2.
+    Stolen time, which the hypervisor gave to other machines, counts as busy, as in EC2's CPUUtilization.
     """
     user, nice, system, idle, waiting, *others = (float(ticks) for ticks in stat.splitlines()[0].split()[1:9])
     busy = user + nice + system + sum(others)
@@ -84,16 +87,19 @@ def read_cpu_times(stat: str) -> tuple[float, float]:
 
 
 def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
-    """Return the dimensions of a group's metric or, where *server* is an instance id, of that instance's."""
+    """Return the CloudWatch dimensions of a metric of the Auto Scaling group *group*.
+
+    If *server* is an instance id, return those of a metric of that instance.
+    """
     named = {"AutoScalingGroupName": group, **({"InstanceId": server} if server else {})}
     return [{"Name": name, "Value": value} for name, value in named.items()]
 
 
 def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
-    """Return the MetricData for PutMetricData of instance *server* between two samples.
+    """Return the MetricData of PutMetricData for the time between two readings of instance *server*.
 
-    Crashes of native code and disks that are nearly full are left out while there are none: their metrics
-    then cost nothing.
+    Counters are published as their growth, other values as in *now*.  The metrics of crashes in native code
+    and of a nearly full disk are left out while they are 0, because they then cost nothing.
     """
     values = {
         ROBOTS: (now.robots, "Count"),
@@ -130,7 +136,10 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
 
 
 def _count_answers(before: Mapping[float, float], now: Mapping[float, float]) -> dict[float, float]:
-    """Return how many answers lie between each bound and the one below; empty intervals are left out."""
+    """Return the number of answers between each bound of the histogram and the next lower bound.
+
+    Only answers between the two readings count; intervals without answers are left out.
+    """
     slots, below = {}, 0.0
     restarted = any(now.get(bound, 0.0) < count for bound, count in before.items())
     for bound in sorted(now):

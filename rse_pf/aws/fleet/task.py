@@ -1,7 +1,7 @@
-"""A task of the agent: one row of the agent's table, and the context that tasks share.
+"""The tasks of the agent: their common type, and the context that they share.
 
-A task is made by a function ``task(context)`` of its own module below `rse_pf.aws.fleet.tasks`.  It keeps its
-state in itself, raises RsePfError or OSError when it fails, and is called again after its period.
+Each module below `rse_pf.aws.fleet.tasks` has a function ``task(context)`` that makes its task.  A task keeps
+its own state, raises RsePfError or OSError when it fails, and is called again after its period.
 """
 
 from __future__ import annotations
@@ -23,29 +23,34 @@ __all__ = ["ALWAYS", "AgentConfig", "AgentContext", "AgentState", "Phase", "Task
 
 
 class Phase(Enum):
-    """Phase of the instance's life cycle; `rse_pf.aws.fleet.tasks.lifecycle` changes it."""
+    """The phase of the instance's life cycle, which the task `lifecycle` changes."""
 
     STARTING = "starting"
-    """Not in service yet."""
+    """The instance is not in service yet."""
     WARMED = "warmed"
-    """Prepared in the warm pool; it takes no robots and publishes nothing."""
+    """The instance waits in the warm pool, installed; it takes no robots and publishes no metrics."""
     SERVING = "serving"
     LEAVING = "leaving"
-    """Draining or drained; the termination hook is not completed yet."""
+    """The server drains or has drained; the termination hook is not completed yet."""
     LEFT = "left"
 
 
 ALWAYS = frozenset(Phase)
-"""Every phase."""
+"""All phases, for tasks that always run."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentConfig:
-    """Group and lifecycle hooks of the instance; object name and local file of the public keys.
+    """The names and paths that the agent's command line gives.
 
-    ``hook`` is completed when the robots are gone, ``launch_hook`` when the server is ready; empty: none.
-    ``keys_file`` lies in memory (tmpfs), so that a revocation reaches the server also when the disk is full;
-    files that must survive a boot are in ``state_folder``.
+    Attributes:
+        group: Name of the Auto Scaling group.
+        hook: Name of the termination hook, which is completed when the server has drained.
+        keys_name: Name of the public keys in the artifact bucket.
+        keys_file: Local file of the public keys; it lies in memory (tmpfs), so that a revocation reaches the
+            server also when the disk is full.
+        state_folder: Folder of files that must survive a boot.
+        launch_hook: Name of the launch hook, which is completed when the server is ready; "": there is none.
     """
 
     group: str
@@ -58,7 +63,7 @@ class AgentConfig:
 
 @dataclass(slots=True, kw_only=True)
 class AgentState:
-    """The phase, and `flush`: run every task with ``flushes`` now, whatever its period says."""
+    """The phase of the instance, and `flush`, which at once runs every task with ``flushes``, due or not."""
 
     phase: Phase = Phase.STARTING
     flush: Callable[[], None] = lambda: None
@@ -66,7 +71,22 @@ class AgentState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentContext:
-    """Objects that tasks share.  ``clients`` maps the name of an AWS service to its boto3 client."""
+    """The objects that tasks share.
+
+    Attributes:
+        machine: This instance and its servers.
+        clients: Maps the name of an AWS service to its boto3 client.
+        artifacts: The artifact bucket.
+        config: Names and paths from the command line.
+        settings: Settings of the platform.
+        log: Writes an event with fields to the agent's log.
+        shipper: Uploads the audit logs; None if there are none.
+        journal: Reads the machine's journal; None ships no journals.
+        clock: Monotonic seconds.
+        wall_clock: Unix seconds.
+        sleep: Waits for some seconds.
+        state: The phase of the instance.
+    """
 
     machine: Instance
     clients: Mapping[str, Any]
@@ -87,12 +107,13 @@ class Task:
     """One row of the agent's table.
 
     Attributes:
-        name: For the log.
-        period_s: Seconds between two calls; 0 is at every step, that is every second.
-        call: The work.
-        phases: When it is called at all.
-        flushes: Whether it is also called before an instance drains, and before its hook is completed.
-        in_thread: Whether it has a thread of its own, because a drain blocks the others.
+        name: Name of the task in the log.
+        period_s: Seconds between two calls; 0 means at every step of the agent, that is every second.
+        call: The function that does the work once.
+        phases: Phases of the instance in which the task is called.
+        flushes: Whether the task is also called before a drain, and before the hook is completed.
+        in_thread: Whether the task has a thread of its own, so that a drain, which blocks the main loop, does
+            not delay it.
     """
 
     name: str

@@ -4,7 +4,7 @@
 2. If an alarm of `WATCHED` fires or a launch fails, AWS returns the group to the previous version.
 3. Otherwise the version is written into the stack's parameter, so that the next deployment keeps it.
 
-Every step can be repeated: an interrupted run is followed or finished by the next one.
+Every step can be repeated: after an interruption, the next call of `upgrade` continues.
 """
 
 from __future__ import annotations
@@ -38,23 +38,24 @@ __all__ = [
 ]
 
 WATCHED = ("errors", "unhealthy", "few-servers", "store")
-"""Alarms that end an upgrade; one that fires already when it begins is left out."""
-# Time between two reads of the refresh, in seconds: it changes about once a minute.
+"""Alarms that roll an upgrade back when they fire; an alarm that fires already at its begin is left out."""
+# Time between two reads of the refresh's or the stack's state, in seconds: it changes about once a minute.
 POLL_S = 10.0
-_ACTIVE = ("Pending", "InProgress", "Baking", "Cancelling", "RollbackInProgress")
-_ABANDONED = ("Cancelled", "Failed")
-_LIFECYCLE = "Lifecycle Action"
-# Last lines of a console that are shown: an error with its traceback.
+# States of an instance refresh that has not ended.
+_ACTIVE_STATES = ("Pending", "InProgress", "Baking", "Cancelling", "RollbackInProgress")
+_FAILED_ACTIVITIES = ("Cancelled", "Failed")  # states of a scaling activity that failed
+_HOOK_MESSAGE = "Lifecycle Action"  # part of AWS's message if an activity failed because of its hook
+# Number of console lines of a failed server that are shown, the last ones: an error with its traceback.
 _CONSOLE_LINES = 12
-_NOT_LISTED: Mapping[str, Any] = {"Status": "Pending"}
-"""Stands for a refresh that AWS has just started and does not list yet."""
-_STACK_BUSY = "_IN_PROGRESS"
-# Reads of the stack before an update counts as failed: half an hour.
+_UNLISTED_REFRESH: Mapping[str, Any] = {"Status": "Pending"}
+"""Description of a refresh that AWS has just started and does not list yet."""
+_STACK_BUSY_SUFFIX = "_IN_PROGRESS"  # ending of the states of a stack that AWS still changes
+# Number of reads of the stack, `POLL_S` apart, before an update counts as failed: half an hour.
 _STACK_POLLS = 180
 
 
 class State(Enum):
-    """State of an instance refresh."""
+    """The state of an instance refresh, which replaces the servers of the group."""
 
     RUNNING = "running"
     ROLLING_BACK = "rolling back"
@@ -64,7 +65,7 @@ class State(Enum):
 
 
 class UpgradeStep(Enum):
-    """Next step of an upgrade."""
+    """The next step of an upgrade."""
 
     FOLLOW = "follow the refresh that runs"
     REFRESH = "replace the servers"
@@ -74,7 +75,16 @@ class UpgradeStep(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Release:
-    """Versions of the launch template: the newest, of the group, of each instance, and of the stack."""
+    """The versions of the launch template in a deployment.
+
+    Attributes:
+        newest: The newest version that exists.
+        group: The version with which the group launches instances.
+        instances: The version of each instance.
+        recorded: The version in the stack's parameter.
+        refresh: The newest instance refresh as AWS describes it; None if there was none.
+        raw_group: The Auto Scaling group as AWS describes it.
+    """
 
     newest: str
     group: str
@@ -86,7 +96,14 @@ class Release:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Upgraded:
-    """How an upgrade ended; *reason* is empty when every server runs *version*."""
+    """The result of an upgrade.
+
+    Attributes:
+        version: The version to which the upgrade led.
+        replaced: Whether servers were replaced.
+        reason: Why the upgrade failed or was rolled back; empty if every server runs *version*.
+        console: The last console lines of a server that did not become ready.
+    """
 
     version: str
     replaced: bool
@@ -95,8 +112,8 @@ class Upgraded:
 
 
 def next_step(release: Release) -> UpgradeStep:
-    """Return what brings every server, and then the stack, to the newest version."""
-    if release.refresh is not None and release.refresh["Status"] in _ACTIVE:
+    """Return the next step towards a deployment whose servers and stack have the newest version."""
+    if release.refresh is not None and release.refresh["Status"] in _ACTIVE_STATES:
         return UpgradeStep.FOLLOW
     if release.group != release.newest or any(version != release.newest for version in release.instances):
         return UpgradeStep.REFRESH
@@ -104,17 +121,17 @@ def next_step(release: Release) -> UpgradeStep:
 
 
 def state_of_refresh(refresh: Mapping[str, Any]) -> State:
-    """Return the state of an instance refresh as AWS describes it."""
+    """Return the state of *refresh*, which is an instance refresh in AWS's description."""
     status = refresh["Status"]
     if status == "RollbackInProgress":
         return State.ROLLING_BACK
-    if status in _ACTIVE:
+    if status in _ACTIVE_STATES:
         return State.RUNNING
     return {"Successful": State.DONE, "RollbackSuccessful": State.ROLLED_BACK}.get(status, State.FAILED)
 
 
 def find_failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime) -> Mapping[str, Any] | None:
-    """Return the first launch since *since* that was abandoned, None if there is none.
+    """Return the first scaling activity since *since* whose launch hook failed; None if there is none.
 
     A launch that failed for lack of capacity does not count: AWS repeats it, and no release causes it.
     """
@@ -122,15 +139,15 @@ def find_failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime)
         activity
         for activity in activities
         if activity["StartTime"] >= since
-        and activity["StatusCode"] in _ABANDONED
+        and activity["StatusCode"] in _FAILED_ACTIVITIES
         and activity["Description"].startswith("Launching")
-        and _LIFECYCLE in activity.get("StatusMessage", "")
+        and _HOOK_MESSAGE in activity.get("StatusMessage", "")
     ]
     return min(failed, key=lambda activity: activity["StartTime"], default=None)
 
 
 def with_version(group: Mapping[str, Any], version: str) -> dict[str, Any]:
-    """Return the launch template or the mixed policy of *group* with *version*: a DesiredConfiguration."""
+    """Return the DesiredConfiguration of a refresh: the template or policy of *group* with *version*."""
     if group.get("MixedInstancesPolicy"):
         policy = copy.deepcopy(dict(group["MixedInstancesPolicy"]))
         _drop_template_name(policy["LaunchTemplate"]["LaunchTemplateSpecification"])["Version"] = version
@@ -139,7 +156,7 @@ def with_version(group: Mapping[str, Any], version: str) -> dict[str, Any]:
 
 
 def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, Any]:
-    """Return the preferences of a refresh: start before end, watched by *alarms*, with rollback."""
+    """Return the preferences of a refresh: launch before terminating, and roll back when *alarms* fire."""
     options: dict[str, Any] = {
         "MinHealthyPercentage": 100,
         "MaxHealthyPercentage": MAX_HEALTHY_PERCENT,
@@ -153,7 +170,7 @@ def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, 
 
 
 def read_state(account: Account, settings: PlatformSettings) -> Release:
-    """Return the versions of a deployment; raises ConfigurationError where nothing is deployed."""
+    """Return the versions of a deployment; raises ConfigurationError if nothing is deployed."""
     names = ResourceNames(settings.cloud.name)
     group = _read_group(account, names)
     refreshes = account.pages(
@@ -171,7 +188,7 @@ def read_state(account: Account, settings: PlatformSettings) -> Release:
 
 
 def versions_behind(account: Account, settings: PlatformSettings) -> tuple[str, str] | None:
-    """Return the version that the group names and the newest one, None where they are the same.
+    """Return the group's version and the newest version of the launch template; None if they are the same.
 
     Raises:
         ConfigurationError: Nothing is deployed, or AWS refused.
@@ -193,11 +210,11 @@ def upgrade(
     """Bring every server to the newest version, or back to the previous one; return the result.
 
     Args:
-        account: Of the deployment.
-        settings: Of the platform.
+        account: AWS account of the deployment.
+        settings: Settings of the platform.
         tell: Called with each line of progress.
-        sleep: Waits between two looks; it may raise KeyboardInterrupt, and AWS then goes on by itself.
-        now: The time in UTC.
+        sleep: Waits between two reads of the state; after a KeyboardInterrupt AWS continues by itself.
+        now: Returns the time in UTC.
 
     Raises:
         ConfigurationError: Nothing is deployed, or AWS refused.
@@ -236,7 +253,7 @@ def upgrade(
 def _start_refresh(
     account: Account, settings: PlatformSettings, release: Release, tell: Callable[[str], None]
 ) -> str:
-    """Start an instance refresh; return its id."""
+    """Start an instance refresh to the newest version, watched by the alarms of `WATCHED`; return its id."""
     names = ResourceNames(settings.cloud.name)
     watched_alarms = {names.alarm(name): name for name in WATCHED}
     rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNames=list(watched_alarms))
@@ -261,7 +278,10 @@ def _follow_refresh(
     tell: Callable[[str], None],
     sleep: Callable[[float], None],
 ) -> Upgraded:
-    """Report the progress until the refresh *identity* has ended; roll back at once when a launch fails."""
+    """Report the progress until the refresh *identity* has ended, and return its result.
+
+    Order AWS to roll back as soon as a launch has failed since *begun*.
+    """
     names = ResourceNames(settings.cloud.name)
     last_line, cause = "", ""
     console: tuple[str, ...] = ()
@@ -270,7 +290,7 @@ def _follow_refresh(
             "autoscaling", "describe_instance_refreshes", "InstanceRefreshes",
             AutoScalingGroupName=names.group, InstanceRefreshIds=[identity],
         )  # fmt: skip
-        refresh = rows[0] if rows else _NOT_LISTED
+        refresh = rows[0] if rows else _UNLISTED_REFRESH
         state = state_of_refresh(refresh)
         line = f"{state.value}: {refresh.get('PercentageComplete', 0)} %"
         if line != last_line:
@@ -297,8 +317,8 @@ def _follow_refresh(
 
 
 def _refresh_order(refresh: Mapping[str, Any]) -> tuple[bool, str]:
-    """Return a key that sorts the newest refresh to the end; one that waits may have no start yet."""
-    return refresh["Status"] in _ACTIVE, str(refresh.get("StartTime", ""))
+    """Return a sort key, greatest for the newest refresh; an active refresh may have no start time yet."""
+    return refresh["Status"] in _ACTIVE_STATES, str(refresh.get("StartTime", ""))
 
 
 def _read_failed_launch(account: Account, names: ResourceNames, begun: datetime) -> Mapping[str, Any] | None:
@@ -309,7 +329,7 @@ def _read_failed_launch(account: Account, names: ResourceNames, begun: datetime)
 
 
 def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the last console lines of the machine of *activity*; none if AWS does not have them."""
+    """Return the last console lines of the machine that *activity* names; none if AWS does not have them."""
     words = [word.strip(".,") for word in str(activity["Description"]).split()]
     instance = next((word for word in words if word.startswith("i-")), "")
     if not instance:
@@ -317,7 +337,7 @@ def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, .
     try:
         output = account.find("ec2", "get_console_output", InstanceId=instance, Latest=True) or {}
     except RsePfError:
-        return ()  # the machine is gone, or this type of machine has no console
+        return ()  # the machine was terminated, or its type has no console
     lines = [line.strip() for line in str(output.get("Output", "")).splitlines() if line.strip()]
     ours = [line for line in lines if "rse-pf" in line]
     return tuple((ours or lines)[-_CONSOLE_LINES:])
@@ -326,7 +346,11 @@ def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, .
 def _record_version(
     account: Account, settings: PlatformSettings, version: str, sleep: Callable[[float], None]
 ) -> None:
-    """Write *version* into the parameter of the stack, whose template stays as it is."""
+    """Update the backend stack's version parameter to *version*, with its template unchanged, and wait.
+
+    Raises:
+        ConfigurationError: The stack has no such parameter, or does not have the value after the update.
+    """
     names = ResourceNames(settings.cloud.name)
     parameters = _read_parameters(account, names)
     if VERSION_PARAMETER not in parameters:
@@ -346,7 +370,7 @@ def _record_version(
     )  # fmt: skip
     for _ in range(_STACK_POLLS):
         stack = _read_stack(account, names)
-        if not stack["StackStatus"].endswith(_STACK_BUSY):
+        if not stack["StackStatus"].endswith(_STACK_BUSY_SUFFIX):
             break
         sleep(POLL_S)
     if _read_parameters(account, names).get(VERSION_PARAMETER) != version:
@@ -398,12 +422,12 @@ def _specification(group: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _drop_template_name(specification: dict[str, Any]) -> dict[str, Any]:
-    """Leave the name out: AWS takes the id or the name, and describes both."""
+    """Remove the template's name from *specification*: AWS describes id and name, but takes only one."""
     specification.pop("LaunchTemplateName", None)
     return specification
 
 
 def _version_of(refresh: Mapping[str, Any]) -> str:
-    """Return the version that a refresh leads to; empty where it names none."""
+    """Return the launch template version to which *refresh* leads; empty if it names none."""
     desired = refresh.get("DesiredConfiguration") or {}
     return str(_specification(desired).get("Version", "")) if desired else ""

@@ -1,4 +1,5 @@
 """The tasks of the agent, one module each.
 
-What an instance repeats for its server belongs here; table and loop belong to `rse_pf.aws.fleet.agent`.
+Work that an instance repeats for its server belongs here; the list of tasks and the loop that calls them
+belong to `rse_pf.aws.fleet.agent`.
 """

@@ -1,4 +1,4 @@
-"""Fetch deny list and roster of the robots, every half second: a disabled robot is cut off within two."""
+"""Fetch the deny list and the roster every half second: a revoked robot is disconnected within 2 s."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ __all__ = ["task"]
 
 
 def task(context: AgentContext) -> Task:
-    """Write deny list and roster if they changed; a missing or invalid one changes nothing."""
+    """Return the task that writes deny list and roster to files of the server if they changed in the bucket.
+
+    The file of a missing or invalid object stays as it is.
+    """
 
     def fetch_access_control() -> None:
         folder = context.config.keys_file.parent
-        # The deny list comes first, so that a roster that cannot be read keeps no revocation from the server.
+        # The deny list comes first: a roster that cannot be read must not delay a revocation.
         fetch(context, DENY_NAME, folder / DENY_NAME, lambda data: from_json(data, DenyList))
         fetch(context, ROBOTS_NAME, folder / ROBOTS_NAME, lambda data: from_json(data, Roster))
 

@@ -1,4 +1,4 @@
-"""Ship the audit log of the servers to the audit bucket."""
+"""Upload the audit logs of this machine's servers to the audit bucket."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ AUDIT_SHIP_S = 60.0
 
 
 def task(context: AgentContext) -> Task:
-    """Upload the entries that are not in the bucket yet; also before and after a drain."""
+    """Return the task that uploads new entries once a minute, and also before and after a drain."""
 
     def ship() -> None:
         count = 0 if context.shipper is None else context.shipper.ship()

@@ -13,10 +13,11 @@ __all__ = ["fetch"]
 
 
 def fetch(context: AgentContext, name: str, file: Path, check: Callable[[bytes], object]) -> bool:
-    """Write the object *name* to *file* if it changed and passes *check*; return whether it exists.
+    """Write the object *name* to *file* if the two differ; return whether the object exists.
 
     Raises:
-        RsePfError: The store does not answer, or *check* refused the object; the file stays as it was.
+        RsePfError: The store does not answer, or *check* raised this error for the object's bytes; then the
+            file stays as it was.
     """
     try:
         fresh = context.artifacts.get(name)

@@ -1,7 +1,7 @@
-"""Ship the machine's journals to the artifact bucket, from where ``rse-pf cloud logs`` shows them.
+"""Upload the machine's journals to the artifact bucket, from where ``rse-pf cloud logs`` shows them.
 
-They would be lost with the machine.  The bucket is reached by the free gateway endpoint: shipping costs an
-object a minute, where CloudWatch Logs would cost an endpoint in each zone.
+Otherwise the journals would be lost with the machine.  S3 is reached by the free gateway endpoint, so that
+this costs one object a minute; CloudWatch Logs would cost an interface endpoint in each zone.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ __all__ = ["JOURNAL_SHIP_S", "piece_name", "task"]
 
 # Time between two uploads, in seconds: a machine that fails loses the lines of at most a minute.
 JOURNAL_SHIP_S = 60.0
-_CURSOR_FILE = "journal.cursor"
-# Pieces of one call, which blocks the other tasks; later calls ship the rest.
-_MAX_PIECES = 8
+_CURSOR_FILE = "journal.cursor"  # file in the state folder with the cursor of the last uploaded entry
+# Most pieces that one call uploads, because it blocks the other tasks; later calls upload the rest.
+_MAX_PIECES_PER_CALL = 8
 
 
 def task(context: AgentContext) -> Task:
-    """Upload what the journals have since the last call; also before and after a drain."""
+    """Return the task that uploads new lines of the journals once a minute, and before and after a drain."""
     return Task(
         name="journals", period_s=JOURNAL_SHIP_S, call=lambda: _ship(context),
         flushes=True,
@@ -29,7 +29,7 @@ def task(context: AgentContext) -> Task:
 
 
 def piece_name(instance: str, first_us: int) -> str:
-    """Return the name of a piece that begins at *first_us*, Unix microseconds; names sort by time."""
+    """Return the object name of a piece whose first line is of *first_us* (Unix µs); names sort by time."""
     return f"{JOURNAL_PREFIX}/{instance}/{first_us:020d}.log"
 
 
@@ -37,11 +37,11 @@ def _ship(context: AgentContext) -> None:
     if context.journal is None:
         return
     file = context.config.state_folder / _CURSOR_FILE
-    for _ in range(_MAX_PIECES):
+    for _ in range(_MAX_PIECES_PER_CALL):
         cursor = file.read_text(encoding="utf-8") if file.exists() else ""
         batch = make_batch(context.journal(cursor))
         if batch is None:
             return
-        # A piece whose cursor was lost is written again, under the same name.
+        # If the cursor is lost after this write, the same lines are written again under the same name.
         context.artifacts.put(piece_name(context.machine.instance_id(), batch.first_us), batch.text)
         replace_file(file, batch.cursor.encode())

@@ -1,4 +1,4 @@
-"""Fetch the public keys of the robots' tokens."""
+"""Fetch the public keys with which the servers verify the robots' tokens."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ _NO_KEYS = "no keys in the bucket yet, so robots are refused; run rse-pf token i
 
 
 def task(context: AgentContext) -> Task:
-    """Write the public keys if they changed; an invalid key set is refused and the old one stays."""
+    """Return the task that writes the public keys to a file of the server if they changed in the bucket.
+
+    If the key set in the bucket is invalid or missing, the file stays as it is.  If there is no file either,
+    an empty key set is written, with which the server refuses all robots.
+    """
 
     def fetch_keys() -> None:
         file = context.config.keys_file

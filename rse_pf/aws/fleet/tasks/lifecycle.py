@@ -1,4 +1,4 @@
-"""Follow the lifecycle of the instance in its group: join it when ready, wait while warmed, drain at the end.
+"""Follow the instance's lifecycle in its group: join when ready, wait in the warm pool, drain before removal.
 
 Auto Scaling publishes the target state of an instance in the instance's metadata.  The agent completes the
 launch hook for each target state, because a warmed instance that is used later waits for the hook again.
@@ -16,11 +16,11 @@ from rse_pf.scaling.boot_time import ready_within_s
 __all__ = ["task"]
 
 _POLL_S = 5.0
-"""Time between two reads of the target state, in seconds; it delays a launch or a drain by no more."""
+"""Time between two reads of the target state, in seconds: the longest delay of a launch or a drain by it."""
 
 
 def task(context: AgentContext) -> Task:
-    """Read the target state, and join or leave the group once for each."""
+    """Return the task that reads the target state, and joins or leaves the group when it has changed."""
     return Task(
         name="lifecycle",
         period_s=_POLL_S,
@@ -30,7 +30,10 @@ def task(context: AgentContext) -> Task:
 
 
 class _Lifecycle:
-    """Progress of the instance: the target state that it joined, and whether its server has ended."""
+    """The progress of the instance: the target state that it has joined, and whether its server drained.
+
+    ``_drained`` is None before the drain, then whether the server exited in time.
+    """
 
     def __init__(self, context: AgentContext) -> None:
         self._context = context
@@ -46,7 +49,10 @@ class _Lifecycle:
             self._join(target)
 
     def _join(self, target: str) -> None:
-        """Complete the launch hook when the server is ready, or abandon the machine after its time limit."""
+        """Complete the launch hook with CONTINUE if the server is ready, with ABANDON after the time limit.
+
+        Before either, only wait.  After CONTINUE the phase is SERVING, or WARMED in the warm pool.
+        """
         context, state = self._context, self._context.state
         if state.phase is Phase.WARMED:
             state.phase = Phase.STARTING
@@ -64,7 +70,7 @@ class _Lifecycle:
         context.log(event, target=target, after_s=round(age_s, 1), hook=did_wait)
 
     def _leave_group(self) -> None:
-        """Drain the server once, and complete the hook as soon as it waits."""
+        """Drain the server, once, and complete the termination hook as soon as the hook waits."""
         context = self._context
         context.state.phase = Phase.LEAVING
         if self._drained is None:
@@ -73,7 +79,7 @@ class _Lifecycle:
             self._drained = drain_server(
                 context.machine, settings=context.settings, clock=context.clock, sleep=context.sleep
             )
-            context.sleep(2 * SYNC_S)  # a server that has ended was still writing
+            context.sleep(2 * SYNC_S)  # the last audit entries of a server are on the disk after this time
             context.state.flush()
         if self._complete(context.config.hook, LaunchAction.CONTINUE.value):
             context.state.phase = Phase.LEFT

@@ -1,8 +1,9 @@
-"""Move robots away from this server when it has too many, so that a new server takes its share.
+"""Move robots away from this server when it has too many, so that all servers have about the same number.
 
-Agents do not communicate.  Each reads from CloudWatch how many robots all servers have, and how many
-servers published that; `rse_pf.scaling.rebalance.share` says how many of its own are too many.  Nothing moves
-while these numbers still change, and moves do not change them, so agents need no coordination.
+Agents do not communicate.  Each agent reads from CloudWatch the number of robots of all servers and the
+number of servers; `rse_pf.scaling.rebalance` computes how many robots of its own server are too many.  No
+robot moves while these two numbers still change, and moves do not change them, so the agents need no
+coordination.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ from rse_pf.scaling.rebalance import MoveOrder, Totals, pause_after_s, plan_orde
 
 __all__ = ["LATE_S", "read_totals", "task"]
 
-# Seconds from the end of a period until its numbers are read: one for the agents, the rest for CloudWatch.
+# Seconds from the end of a period until its numbers are read: one for the agents to publish them, the rest
+# for CloudWatch to process them.
 LATE_S = 8.0
-# Periods that are read: two are compared, and CloudWatch may lack the newest ones.
+# Number of periods that are read: the newest two are compared, and CloudWatch may lack the last ones.
 _PERIODS = 4
 
 
 def task(context: AgentContext) -> Task:
-    """Read the totals once in each period, and have the server move its surplus of robots."""
+    """Return the task that reads the totals once in each period, and has the server move surplus robots."""
     return Task(
         name="rebalancing",
         period_s=0.0,
@@ -42,7 +44,7 @@ def task(context: AgentContext) -> Task:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _LastOrder:
-    """The last order, and the number of robots that the server had then."""
+    """The last order, the number of robots that the server had then, and of failed orders in a row."""
 
     order: MoveOrder
     robots: int
@@ -58,7 +60,7 @@ class _Rebalancing:
         self._asked: _LastOrder | None = None
 
     def follow(self) -> None:
-        """Look once in each period, and not while the robots of the last order still move."""
+        """Read the totals and order moves once in each period, but not in the pause after an order."""
         context = self._context
         period = int((context.wall_clock() - LATE_S) // self._period_s)
         if period == self._period or context.clock() < self._quiet_until_s:
@@ -67,9 +69,9 @@ class _Rebalancing:
         try:
             robots = int(read_page(context.machine.page()).robots)
         except Disconnected:
-            return  # no server runs, and the task that publishes says so
+            return  # no server runs; the task that publishes metrics logs this error
         if robots == 0:
-            return  # saves the request, which is charged
+            return  # no request to CloudWatch is needed, and each costs a fee
         totals = read_totals(
             context.clients["cloudwatch"], context.config.group, self._period_s, period * self._period_s
         )
@@ -95,13 +97,15 @@ class _Rebalancing:
 
 
 def read_totals(cloudwatch: Any, group: str, period_s: int, end_s: float) -> tuple[Totals, ...]:
-    """Return the robots and the servers of the newest periods before *end_s*, the newest first.
+    """Return the totals of the last `_PERIODS` periods before *end_s*, the newest first.
+
+    Periods that CloudWatch does not have are left out.
 
     Args:
-        cloudwatch: A boto3 client.
+        cloudwatch: A boto3 client of CloudWatch.
         group: Name of the Auto Scaling group.
-        period_s: Length of a period.
-        end_s: Unix seconds, a multiple of *period_s*.
+        period_s: Length of a period in seconds.
+        end_s: End of the newest period, Unix seconds, a multiple of *period_s*.
 
     Raises:
         ConfigurationError: AWS refused.

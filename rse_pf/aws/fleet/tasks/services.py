@@ -1,7 +1,7 @@
-"""Follow the list of published services: fetch what it names, check it, and let the server load it.
+"""Follow the list of published services: fetch their archives, check them, and have the server load them.
 
-The agent only reads the bucket; operators write it with ``rse-pf service publish``.  A list that is refused
-changes nothing, and is tried again when it has changed.
+The agent only reads the bucket; operators publish with ``rse-pf service publish``.  If a list or an archive
+is invalid, the installed services stay, and the agent waits until the list changes.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from rse_pf.services.custom.publishing import (
 __all__ = ["FOLDER", "task"]
 
 FOLDER = "services"
-"""Folder of the services in the agent's state folder; the systemd units name it, too."""
-_EMPTY = msgspec.json.encode(PublishedList())
+"""Name of the folder of the services in the agent's state folder; rse-pf.service names it, too."""
+_EMPTY = msgspec.json.encode(PublishedList())  # stands for a list that was never published
 
 
 def task(context: AgentContext) -> Task:
-    """Install the services of the list if it changed, and have the server load them."""
+    """Return the task that installs the listed services when the list changes; the server then loads them."""
     folder = PublishedFolder(context.config.state_folder / FOLDER)
     refused, loaded = b"", b""
 
     def fetch(entry: PublishedService) -> bytes:
         name = archive_name(entry.archive)
         size = context.artifacts.head(name).size
-        if size != entry.size:  # before it is read into memory
+        if size != entry.size:  # checked before the archive is read into memory
             raise damaged_error(f"the archive of {entry.name} is {size} bytes, the list says {entry.size}")
         return context.artifacts.get(name)
 
@@ -56,7 +56,7 @@ def task(context: AgentContext) -> Task:
             try:
                 context.machine.reload_services()
             except Disconnected:
-                return  # a server that starts reads the folder itself
+                return  # no server runs; a server that starts reads the folder itself
             loaded = data
 
     return Task(name="services", period_s=float(LIST_POLL_PERIOD_S), call=follow, in_thread=True)

@@ -1,8 +1,9 @@
-"""Drain the server when AWS announces that it takes the instance back: a Spot interruption.
+"""Drain the server when AWS announces that it takes the Spot instance back.
 
-The notice comes two minutes before the interruption: robots move within seconds, and the machine stays idle
-until it is taken.  A recommendation to rebalance may come earlier, to all servers of a pool at once, and is
-only logged: the group starts a replacement (`stacks.capacity`), and then ends this one by its drain hook.
+The notice comes two minutes before the interruption: the robots move within seconds, and the machine is idle
+until AWS takes it.  A recommendation to rebalance may come earlier, for all instances of a pool at once, and
+is only logged: the group starts a replacement (`stacks.capacity`), and then removes this instance, whose
+drain hook moves the robots.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from rse_pf.aws.fleet.task import AgentContext, Phase, Task
 
 __all__ = ["LOOK_EVERY_S", "task"]
 
-# Time between two reads of the notice, in seconds: a drain begins less than 5 s after it.
+# Time between two reads of the notice, in seconds: a drain begins less than 5 s after the notice.
 LOOK_EVERY_S = 2.0
 
 
 def task(context: AgentContext) -> Task:
-    """Read the notice every two seconds on Spot deployments, and drain once."""
+    """Return the task that reads the notice every two seconds if ``cloud.spot`` is set, and drains once."""
     is_spot = context.settings.cloud.spot
     last = ""
 

@@ -1,7 +1,7 @@
-"""Publish that the bucket does not answer this server's data service, for an alarm; no server is replaced.
+"""Publish a metric while the bucket does not answer this server's data service; an alarm reads it.
 
-All servers share the bucket, so replacing a server would not help, and its replacement could not boot.
-Meanwhile robots get typed errors for their data, and poses as before.
+No server is replaced for this reason: all servers share the bucket, and a new server could not boot without
+it.  Meanwhile robots get errors for their data, and poses as before.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ from rse_pf.scaling.operator_alarms import STORE_ERRORS, STORE_PERIOD_S
 
 __all__ = ["task"]
 
-_HIGH_RESOLUTION = 1
+_HIGH_RESOLUTION_S = 1  # StorageResolution of CloudWatch in seconds: needed for periods below a minute
 
 
 def task(context: AgentContext) -> Task:
-    """Check every ten seconds, in a thread, because a check of a silent bucket blocks for seconds."""
+    """Return the task that checks the bucket every ten seconds.
+
+    It has a thread of its own, because a check blocks for seconds while the bucket does not answer.
+    """
     failing = False
 
     def publish_failure() -> None:
@@ -33,7 +36,7 @@ def task(context: AgentContext) -> Task:
             return
         datum = {
             "MetricName": STORE_ERRORS, "Dimensions": dimensions_of(context.config.group), "Value": 1.0,
-            "Unit": "Count", "StorageResolution": _HIGH_RESOLUTION,
+            "Unit": "Count", "StorageResolution": _HIGH_RESOLUTION_S,
         }  # fmt: skip
         call_api(
             context.clients["cloudwatch"], "put_metric_data", Namespace=NAMESPACE, MetricData=[datum]
