@@ -1,7 +1,7 @@
-"""Check before a deployment that the account allows it: quotas, certificate, bootstrap.
+"""Check before a deployment that the account is ready for it: quotas, certificate, bootstrap.
 
-The checks are independent: one that AWS does not permit gives a warning, and the next one follows.  Nothing
-is changed.
+The checks are independent: a check whose call AWS refuses gives a warning, and the others are made
+nevertheless.  Nothing is changed.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from rse_pf.errors import ConfigurationError, StoreError
 __all__ = ["NOT_BOOTSTRAPPED", "Check", "check_account"]
 
 NOT_BOOTSTRAPPED = "the CDK is not bootstrapped"
-"""Beginning of the failure that ``rse-pf cloud up`` repairs by itself."""
+"""Beginning of the text of a failed check that ``rse-pf cloud up`` repairs by a bootstrap."""
 
-# Service and code of a quota: vCPUs of on-demand instances, concurrent executions of Lambda, and VPCs.
+# Quota of vCPUs of on-demand instances: service and quota code.
 _VCPUS_QUOTA = ("ec2", "L-1216C47A")
+# Quota of concurrent executions of AWS Lambda: service and quota code.
 _EXECUTIONS_QUOTA = ("lambda", "L-B99A9384")
+# Quota of VPCs in a region: service and quota code.
 _VPCS_QUOTA = ("vpc", "L-F678F1CE")
-# Executions of an account that AWS keeps for functions without a reservation.
+# Number of concurrent executions of an account that AWS keeps for functions without a reservation.
 _ALWAYS_UNRESERVED = 100
-# vCPUs of the types from ``medium`` to ``large``; ``Nxlarge`` has 4 N.
+# Number of vCPUs of an instance type from ``medium`` to ``large``; a type ``Nxlarge`` has 4 N.
 _VCPUS_BELOW_XLARGE = 2
 _ASK_FOR_MORE = "ask for more in the Service Quotas console"
 
 
 class Check(NamedTuple):
-    """The result of one check: ``grade`` is ok, warn or fail; ``fix`` says what to do unless it is ok."""
+    """The result of a check: ``grade`` (ok, warn, fail), the finding ``what``, and its remedy ``fix``."""
 
     grade: str
     what: str
@@ -43,16 +45,17 @@ class Check(NamedTuple):
 
 
 def check_account(account: Account, settings: PlatformSettings) -> Iterator[Check]:
-    """Yield the result of each check; a service that does not answer ends none of the others.
+    """Yield the results of all checks; if AWS refuses or does not answer one, its result is a warning.
 
     Raises:
         ConfigurationError: AWS does not accept the credentials.
-        StoreError: AWS does not answer.
+        StoreError: AWS does not answer the first call, which asks who signed in.
     """
     caller = account.find("sts", "get_caller_identity") or {}
     yield Check("ok", f"signed in as {caller.get('Arn', '?')}, region {account.region}")
     checks: tuple[Callable[[Account, PlatformSettings], Check], ...] = (
-        _bootstrap, _check_certificate, _check_instance_type, _check_vcpus, _check_executions, _check_vpcs,
+        _check_bootstrap, _check_certificate, _check_instance_type, _check_vcpus, _check_executions,
+        _check_vpcs,
     )  # fmt: skip
     for check in checks:
         try:
@@ -61,7 +64,7 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
             yield Check("warn", f"not checked: {error.message}", error.hint)
 
 
-def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
+def _check_bootstrap(account: Account, settings: PlatformSettings) -> Check:
     version = read_bootstrap_version(account, settings)
     if version is None and (qualifier := find_foreign_qualifier(account, settings)) is not None:
         stack = toolkit_stack(settings.cloud.bootstrap_qualifier)
@@ -119,7 +122,7 @@ def _check_instance_type(account: Account, settings: PlatformSettings) -> Check:
     )  # fmt: skip
     offered = {(str(row["InstanceType"]), str(row["Location"])) for row in rows}
     rows_of_zones = account.pages("ec2", "describe_availability_zones", "AvailabilityZones")
-    # As Fn::GetAZs orders them, of which the stacks take the first.
+    # The stacks take the first zones in the order of Fn::GetAZs, which is that of their names.
     zones = sorted(str(row["ZoneName"]) for row in rows_of_zones)[: zone_count(settings)]
     lacking = [f"{kind} in {zone}" for kind in kinds for zone in zones if (kind, zone) not in offered]
     if any(all((kind, zone) not in offered for kind in kinds) for zone in zones):
@@ -134,7 +137,7 @@ def _check_instance_type(account: Account, settings: PlatformSettings) -> Check:
 
 
 def _check_vcpus(account: Account, settings: PlatformSettings) -> Check:
-    # An instance that drains still runs when its replacement starts.
+    # One server more: an instance that drains still runs when its replacement starts.
     needed = (settings.scaling.max_servers + 1) * _vcpus_of(settings.cloud.instance_type)
     return _check_quota(
         account, _VCPUS_QUOTA, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
@@ -163,7 +166,7 @@ def _check_quota(account: Account, quota: tuple[str, str], needed: int, need: st
     service, code = quota
     query = {"ServiceCode": service, "QuotaCode": code}
     answer = account.find("service-quotas", "get_service_quota", **query)
-    if answer is None:  # the account has the default of AWS
+    if answer is None:  # the account has no quota of its own, so AWS's default applies
         answer = account.find("service-quotas", "get_aws_default_service_quota", **query)
     if answer is None:
         return Check(

@@ -1,6 +1,6 @@
-"""Build and deploy: run `scripts/assets.py`, and the pinned command line of the CDK by `scripts/cdk.sh`.
+"""Build and deploy: run `scripts/assets.py`, and the CDK's command line, pinned, by `scripts/cdk.sh`.
 
-Both belong to a checkout, not to the installed package.
+Both scripts belong to a checkout of the repository, not to the installed package.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from rse_pf.errors import DeploymentFailed, UsageError
 __all__ = ["PACKAGES", "CdkTools", "are_packages_built"]
 
 PACKAGES = Path("build")
-"""Where `scripts/assets.py` puts the packages, in a checkout."""
+"""Folder of a checkout into which `scripts/assets.py` writes the packages of servers and functions."""
 
 
 def are_packages_built(checkout: Path) -> bool:
-    """Return whether packages were built; the synthesis refuses those of other sources."""
+    """Return whether the packages exist in *checkout*; whether they are up to date is checked by `stacks`."""
     return all(any((checkout / PACKAGES / name).glob("*")) for name in ("servers", "lambda"))
 
 
 class CdkTools:
-    """The tools of the checkout in the folder *checkout*; their output goes to the terminal.
+    """Runs the scripts of the checkout in the folder *checkout*; their output goes to the terminal.
 
-    *settings_file* holds the settings; None means the checkout's cdk.json.
+    *settings_file* holds the settings of the deployment; None means the checkout's cdk.json.
     """
 
     def __init__(
@@ -41,22 +41,22 @@ class CdkTools:
 
     @property
     def has_packages(self) -> bool:
-        """Whether packages were built."""
+        """Whether the packages exist in the checkout."""
         return are_packages_built(self._checkout)
 
     def build(self) -> None:
-        """Build the packages; raises DeploymentFailed."""
+        """Build the packages of servers and functions; raises DeploymentFailed if the build fails."""
         self._run("the build of the packages", [sys.executable, "scripts/assets.py"])
 
     def bootstrap(self) -> None:
-        """Prepare the account and region for the CDK, in the qualifier's stack; raises DeploymentFailed."""
+        """Deploy the CDK's bootstrap stack with our qualifier in the region; raises DeploymentFailed."""
         where = f"aws://{self._account_id}/{self._cloud.region}"
         qualifier = self._cloud.bootstrap_qualifier
         options = ["--qualifier", qualifier, "--toolkit-stack-name", toolkit_stack(qualifier)]
         self._cdk("the bootstrap", ["bootstrap", where, *options])
 
     def deploy(self, stack: str) -> None:
-        """Deploy one stack, and nothing that it depends on; raises DeploymentFailed."""
+        """Deploy one stack, without the stacks on which it depends; raises DeploymentFailed."""
         options = ["--exclusively", "--require-approval", "never", "--progress", "events"]
         self._cdk(f"the deployment of {stack}", ["deploy", stack, *options])
 

@@ -1,4 +1,4 @@
-"""Read the state of a deployment: its stacks, its groups of servers, and whether it is parked.
+"""Read the state of a deployment: its stacks, its Auto Scaling groups, and whether it is parked.
 
 Nothing is changed.
 """
@@ -21,7 +21,7 @@ __all__ = ["Deployment", "GroupSize", "ParkNote", "read_deployment", "read_note"
 
 
 class GroupSize(msgspec.Struct, frozen=True, kw_only=True):
-    """The bounds of one Auto Scaling group; ``instances`` counts those that are there in any state."""
+    """Minimum, wanted and maximum size of an Auto Scaling group; ``instances`` counts those in any state."""
 
     min_servers: int
     wanted_servers: int
@@ -30,21 +30,29 @@ class GroupSize(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParkNote(msgspec.Struct, frozen=True, kw_only=True):
-    """The sizes of a parked deployment before parking; kept in the SSM parameter ``parked``."""
+    """The note that a deployment is parked, with the sizes to restore; an SSM parameter holds it as JSON."""
 
     groups: dict[str, GroupSize]
-    """By name."""
+    """Size of each Auto Scaling group before it was parked, by the group's name."""
     since: str
-    """UTC, ISO 8601."""
+    """Time at which it was parked, UTC, ISO 8601."""
     by: str = "operator"
-    """Who parked it: operator or timer."""
+    """Who parked it: ``operator`` or ``timer`` (the idle timer)."""
     deep: bool = False
-    """Whether the load balancer, the endpoints and all other stacks but Data went, too."""
+    """Whether all stacks but Data were destroyed, too, with the load balancer and the endpoints."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Deployment:
-    """Status of each existing stack by box, groups by name, and the note of a parked deployment."""
+    """The state of a deployment.
+
+    Attributes:
+        stacks: CloudFormation's status of each existing stack, by its short name such as ``Backend``.
+        groups: Size of each Auto Scaling group, by name.
+        note: The note of a parked deployment; None if it is not parked.
+        is_bootstrapped: Whether the CDK is bootstrapped in the region.
+        url: Address for robots; empty if the backend stack does not exist.
+    """
 
     stacks: Mapping[str, str] = field(default_factory=dict)
     groups: Mapping[str, GroupSize] = field(default_factory=dict)
@@ -54,7 +62,11 @@ class Deployment:
 
     @property
     def stage(self) -> str:
-        """Return absent, incomplete, up, parked or deeply parked, in this order of precedence."""
+        """Return ``parked`` or ``deeply parked`` if there is a note.
+
+        Else return ``absent`` if no stack but Data exists, ``up`` if all stacks are complete, or
+        ``incomplete``.
+        """
         if self.note is not None:
             return "deeply parked" if self.note.deep else "parked"
         if not set(self.stacks) - {"Data"}:
@@ -64,7 +76,7 @@ class Deployment:
 
 
 def read_deployment(account: Account, settings: PlatformSettings) -> Deployment:
-    """Return the state of the deployment ``cloud.name``.
+    """Return the state of the deployment with the name ``cloud.name``.
 
     Raises:
         ConfigurationError: AWS refused.
@@ -84,7 +96,10 @@ def read_deployment(account: Account, settings: PlatformSettings) -> Deployment:
 
 
 def read_sizes(account: Account, names: ResourceNames) -> dict[str, GroupSize]:
-    """Return every Auto Scaling group of the deployment, found by its tag; raises as `read_deployment`."""
+    """Return the sizes of the Auto Scaling groups with the deployment's tag, by the groups' names.
+
+    Raises the errors of `read_deployment`.
+    """
     rows = account.pages(
         "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups",
         Filters=[{"Name": f"tag:{DEPLOYMENT_TAG}", "Values": [names.prefix]}],
@@ -93,7 +108,10 @@ def read_sizes(account: Account, names: ResourceNames) -> dict[str, GroupSize]:
 
 
 def read_note(account: Account, names: ResourceNames) -> ParkNote | None:
-    """Return the note of a parked deployment; None if it is not parked.  Raises as `read_deployment`."""
+    """Return the note of a parked deployment; None if it is not parked.
+
+    Raises the errors of `read_deployment`.
+    """
     parameter = account.find("ssm", "get_parameter", Name=names.parked)
     if parameter is None:
         return None

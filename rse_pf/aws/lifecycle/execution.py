@@ -1,6 +1,6 @@
-"""Carry out the steps of a plan: thin effects on CloudFormation, Auto Scaling, alarms and parameters.
+"""Carry out the steps of a plan by calls to CloudFormation, Auto Scaling, CloudWatch and SSM.
 
-Time is an argument.  The CDK's command line and the build of the packages are behind `Tools`.
+Time is an argument.  `CdkTools` runs the CDK's command line and the build of the packages.
 """
 
 from __future__ import annotations
@@ -32,19 +32,22 @@ from rse_pf.scaling.health import DRAIN_S, GRACE_S
 
 __all__ = ["StepContext", "carry_out"]
 
-# Time between two reads of a state, in seconds.
+# Time between two reads of the state of a stack or a group while a step waits for it, in seconds.
 _POLL_S = 5.0
 # Time limit of a change of a stack, in seconds: the load balancer and endpoints take up to half an hour.
-_STACK_S = 2400.0
-# Time limit until all servers have ended, in seconds, in addition to `DRAIN_S`.
-_EMPTY_S = 600.0
+_STACK_TIMEOUT_S = 2400.0
+# Time limit until all servers are terminated, in seconds, in addition to `DRAIN_S`.
+_EMPTY_TIMEOUT_S = 600.0
 # Time limit until all wanted servers are healthy, in seconds, in addition to `GRACE_S`.
-_HEALTHY_S = 600.0
+_HEALTHY_TIMEOUT_S = 600.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepContext:
-    """The account, settings, tools and clocks that steps use; ``tell`` reports a line of progress."""
+    """The account, settings, tools and clocks that steps use.
+
+    ``tell`` shows a line of progress to the operator; ``clock`` returns monotonic seconds, ``now`` UTC.
+    """
 
     account: Account
     settings: PlatformSettings
@@ -56,16 +59,16 @@ class StepContext:
 
     @property
     def names(self) -> ResourceNames:
-        """Return the names of the deployment."""
+        """Return the names of the deployment's AWS resources."""
         return ResourceNames(self.settings.cloud.name)
 
 
 def carry_out(steps: Iterable[Step], world: StepContext) -> None:
-    """Carry out *steps* in order, and report each before it begins.
+    """Carry out *steps* in order, and show the description of each step before it begins.
 
     Raises:
         DeploymentFailed: A stack could not be deployed or destroyed, or servers did not become healthy or
-            end in time.
+            were not terminated in time.
         ConfigurationError: AWS refused.
         StoreError: AWS does not answer.
     """
@@ -102,8 +105,12 @@ def _destroy(step: Step, world: StepContext) -> None:
 
 
 def _await_stack(world: StepContext, stack: str) -> str:
-    """Return the status of *stack* when AWS no longer changes it; empty when it does not exist."""
-    deadline = world.clock() + _STACK_S
+    """Wait until AWS no longer changes *stack*, and return its status; "" if it does not exist.
+
+    Raises:
+        DeploymentFailed: The change took longer than `_STACK_TIMEOUT_S`.
+    """
+    deadline = world.clock() + _STACK_TIMEOUT_S
     while True:
         answer = world.account.find("cloudformation", "describe_stacks", StackName=stack)
         status = str(answer["Stacks"][0]["StackStatus"]) if answer and answer["Stacks"] else ""
@@ -111,14 +118,17 @@ def _await_stack(world: StepContext, stack: str) -> str:
             return status
         if world.clock() > deadline:
             raise DeploymentFailed(
-                f"the stack {stack} is {status} after {_STACK_S:g} s",
+                f"the stack {stack} is {status} after {_STACK_TIMEOUT_S:g} s",
                 hint="look at its events in the console, then repeat the command",
             )
         world.sleep(_POLL_S)
 
 
 def _read_failure_reason(account: Account, stack: str) -> str:
-    """Return why CloudFormation failed: the first failure that names no other one."""
+    """Return the resource that failed first in the events of *stack*, and CloudFormation's reason.
+
+    Later failures are mostly consequences of the first one.
+    """
     rows = account.pages("cloudformation", "describe_stack_events", "StackEvents", StackName=stack)
     failed = [row for row in rows if str(row["ResourceStatus"]).endswith("_FAILED")]
     reasons = [
@@ -128,7 +138,10 @@ def _read_failure_reason(account: Account, stack: str) -> str:
 
 
 def _write_park_note(step: Step, world: StepContext) -> None:
-    """Note the sizes of the groups before they are changed; an existing note keeps its sizes."""
+    """Write the sizes of the groups into the note before they are changed.
+
+    An existing note keeps its sizes and its time; whether it is a deep one is updated.
+    """
     note = read_note(world.account, world.names)
     groups = note.groups if note is not None else read_sizes(world.account, world.names)
     since = note.since if note is not None else world.now().isoformat(timespec="seconds")
@@ -145,11 +158,11 @@ def _empty(step: Step, world: StepContext) -> None:
 
 
 def _await_empty(step: Step, world: StepContext) -> None:
-    deadline = world.clock() + DRAIN_S + _EMPTY_S
+    deadline = world.clock() + DRAIN_S + _EMPTY_TIMEOUT_S
     while remaining := sum(group.instances for group in read_sizes(world.account, world.names).values()):
         if world.clock() > deadline:
             raise DeploymentFailed(
-                f"{remaining} servers did not end within {DRAIN_S + _EMPTY_S:g} s",
+                f"{remaining} servers were not terminated within {DRAIN_S + _EMPTY_TIMEOUT_S:g} s",
                 hint="rse-pf cloud status shows them; then repeat the command",
             )
         world.sleep(_POLL_S)
@@ -158,7 +171,7 @@ def _await_empty(step: Step, world: StepContext) -> None:
 def _fill(step: Step, world: StepContext) -> None:
     scaling = world.settings.scaling
     local = world.now().astimezone(zone_named(scaling.time_zone))
-    # Scheduled actions that were due meanwhile are not made up for by AWS.
+    # AWS does not repeat the scheduled actions that were due while the group was parked.
     fill_groups(
         world.account, world.names, least=minimum_at(parse_schedule(scaling.schedule), local, otherwise=0)
     )
@@ -173,7 +186,7 @@ def _forget(step: Step, world: StepContext) -> None:
 
 
 def _await_healthy(step: Step, world: StepContext) -> None:
-    limit_s = GRACE_S + _HEALTHY_S
+    limit_s = GRACE_S + _HEALTHY_TIMEOUT_S
     deadline = world.clock() + limit_s
     while True:
         group = read_group(world.account, world.settings, now=world.now(), asks_robots=False)

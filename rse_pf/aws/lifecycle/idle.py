@@ -1,8 +1,9 @@
-"""Park a deployment that nobody has used for hours, and resume a parked one at the times of the schedule.
+"""Park a deployment that nobody has used for `IDLE_HOURS`, and resume a parked one by its schedule.
 
-The function runs in AWS Lambda: each hour where ``cloud.idle_action`` says so, and at the entries of
-``scaling.schedule``.  It may read metrics, and end and start the servers of its own groups.  It can delete
-nothing but the note that the deployment is parked, so ``rse-pf cloud resume`` undoes its mistakes.
+The function runs in AWS Lambda: each hour if ``cloud.idle_action`` says so, and at the entries of
+``scaling.schedule`` that resume.  It may read metrics, and change the sizes of its own groups, which
+terminates and launches servers.  It can delete nothing but the note that the deployment is parked, so that
+``rse-pf cloud resume`` undoes its mistakes.
 """
 
 from __future__ import annotations
@@ -41,25 +42,32 @@ _HOUR_S = 3600
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hour:
-    """The metrics of the group in one hour; None where no agent published any."""
+    """The metrics of the group in one hour; None if no agent published the metric in that hour."""
 
     requests: float | None
+    """Number of requests to all servers."""
     robots: float | None
-    """Mean over the hour of the robots on all servers."""
+    """Mean number of robots on all servers together, over the hour."""
 
 
 def is_idle(hours: Sequence[Hour]) -> bool:
-    """Return whether nobody used the platform in any of the last `IDLE_HOURS` of *hours*, oldest first.
+    """Return whether there was no request and no robot in each of the last `IDLE_HOURS` of *hours*.
 
-    An hour of which nothing is known is not idle: silent agents are a failure, and a deployment that is
-    younger, or was resumed later, has not been idle for so long.
+    *hours* are in order, oldest first.  An hour without metrics is not idle: silent agents are a failure, and
+    a deployment that was created or resumed since then has not been idle for so long.
     """
     last = hours[-IDLE_HOURS:]
     return len(last) == IDLE_HOURS and all(hour.requests == 0 and hour.robots == 0 for hour in last)
 
 
 def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime, topic: str) -> str:
-    """Park the deployment if it is idle at *now*, in UTC; return a line that says what was done and why.
+    """Park the deployment if it is idle; return a line for the log that says what was done and why.
+
+    Args:
+        account: AWS account of the deployment.
+        settings: Settings of the platform.
+        now: The time in UTC.
+        topic: ARN of the SNS topic that is notified before the deployment is parked.
 
     Raises:
         ConfigurationError: AWS refused.
@@ -73,7 +81,7 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
     if not is_idle(hours):
         return f"{names.prefix} was used within {IDLE_HOURS} hours, or some hours have no metrics"
     message = f"{names.prefix} was idle for {IDLE_HOURS} hours and is parked now; rse-pf cloud resume"
-    # Notify before parking: once the groups are empty, a repetition finds the deployment parked and ends.
+    # Notify first: if a later call fails, the repetition notifies again; once the groups are empty, it stops.
     account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=message)
     if note is None:
         since = now.isoformat(timespec="seconds")
@@ -85,9 +93,16 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
 
 
 def resume_if_parked(account: Account, settings: PlatformSettings, *, least: int, topic: str) -> str:
-    """Resume a parked deployment with *least* servers or more; return a line that says what was done.
+    """Resume a parked deployment with at least *least* servers; return a line that says what was done.
 
-    Its operator or the timer may have parked it.  One that is parked deeply has no stacks to resume.
+    It does not matter whether the operator or the timer parked the deployment.  A deployment that is not
+    parked, or is parked deeply and so has no stacks, stays as it is.
+
+    Args:
+        account: AWS account of the deployment.
+        settings: Settings of the platform.
+        least: Minimum size of the group of backend servers.
+        topic: ARN of the SNS topic that is notified.
 
     Raises:
         ConfigurationError: AWS refused.
@@ -103,12 +118,15 @@ def resume_if_parked(account: Account, settings: PlatformSettings, *, least: int
     fill_groups(account, names, least=least)
     enable_alarms(account, names)
     account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is resumed", Message=message)
-    delete_note(account, names)  # at the end: what failed is repeated
+    delete_note(account, names)  # last: after a failure the next call resumes again
     return message
 
 
 def handler(event: dict[str, Any], context: object) -> str:
-    """Do once what *event* asks for: resume, where it has `RESUME_FIELD`, else park if nobody came."""
+    """Resume the deployment if *event* has the field `RESUME_FIELD`, else park it if it is idle.
+
+    Return the line that was logged.
+    """
     settings = load_settings(Path(__file__).parents[3] / "settings.json")
     account, topic = Account(settings.cloud.region), os.environ["RSE_PF_TOPIC"]
     if RESUME_FIELD in event:
@@ -122,7 +140,7 @@ def handler(event: dict[str, Any], context: object) -> str:
 def _read_hours(
     account: Account, names: ResourceNames, groups: dict[str, GroupSize], count: int, now: datetime
 ) -> list[Hour]:
-    """Return the last *count* whole hours before *now*, oldest first."""
+    """Return the metrics of the last *count* whole hours before *now*, oldest first."""
     end_s = int(now.timestamp()) // _HOUR_S * _HOUR_S
     end = datetime.fromtimestamp(end_s, timezone.utc)
     values: dict[str, dict[int, float]] = {"requests": {}, "robots": {}}

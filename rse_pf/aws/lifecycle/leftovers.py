@@ -1,7 +1,7 @@
-"""Find resources that remain after the stacks are destroyed: kept on purpose, or forgotten.
+"""Find the deployment's resources that no existing stack contains: kept on purpose, or forgotten.
 
-Resources of the platform have the tag ``rse-pf`` or a name with one of our prefixes; what an existing stack
-owns is not left over.  Nothing is deleted; each leftover names the command that deletes it.
+Resources of the platform have the tag ``rse-pf`` or a name with one of our prefixes.  Nothing is deleted;
+each leftover names the command that deletes it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from rse_pf.errors import ConfigurationError
 
 __all__ = ["Leftover", "find_leftovers"]
 
-_OF_FUNCTIONS = "/aws/lambda/"
-_KEPT = {
+_FUNCTION_LOG_PREFIX = "/aws/lambda/"  # begins the names of the log groups that Lambda makes by default
+_REASONS_KEPT = {
     "bucket": "kept on purpose: holds maps, packages, access logs or audit logs",
     "secret": "kept on purpose: the signing key",
 }
@@ -26,9 +26,14 @@ _KEPT = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, order=True)
 class Leftover:
-    """A resource that is left over; ``remove`` is the command that deletes it.
+    """A resource that no stack contains.
 
-    ``unread`` means that it could not be inspected, so that it may belong to somebody else.
+    Attributes:
+        kind: Kind of the resource, such as ``bucket`` or ``log group``.
+        name: Name or id of the resource.
+        why: Why it exists: kept on purpose, forgotten, or not readable.
+        remove: The command that deletes it.
+        unread: Whether its tags could not be read, so that it may belong to another deployment.
     """
 
     kind: str
@@ -39,7 +44,10 @@ class Leftover:
 
 
 def find_leftovers(account: Account, of: ResourceNames) -> list[Leftover]:
-    """Return what no existing stack owns, sorted by kind and name; raises as `Account.find`."""
+    """Return the resources of the deployment *of* that no existing stack contains, sorted by kind and name.
+
+    Raises the errors of `Account.find`.
+    """
     owned = {
         str(row.get("PhysicalResourceId", ""))
         for stack in list_living_stacks(account, of)
@@ -55,8 +63,8 @@ def find_leftovers(account: Account, of: ResourceNames) -> list[Leftover]:
     }
     return sorted(
         Leftover(
-            kind=kind, name=name, remove=_remove(kind, name), unread=name in unread,
-            why=unread.get(name) or _KEPT.get(kind, "forgotten"),
+            kind=kind, name=name, remove=_removal_command(kind, name), unread=name in unread,
+            why=unread.get(name) or _REASONS_KEPT.get(kind, "forgotten"),
         )
         for kind, name in leftovers
     )  # fmt: skip
@@ -65,19 +73,22 @@ def find_leftovers(account: Account, of: ResourceNames) -> list[Leftover]:
 def _list_resources(
     account: Account, of: ResourceNames, unread: dict[str, str]
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield kind, name, and the other name that CloudFormation may know it by; fill *unread* with reasons."""
+    """Yield kind and name of each resource of the deployment, and its ARN if CloudFormation may use that.
+
+    Write the names of buckets whose tags cannot be read into *unread*, with the reason.
+    """
     for row in account.pages("s3", "list_buckets", "Buckets"):
         try:
             is_ours = _is_tagged(account, of, row["Name"])
         except ConfigurationError as error:
-            unread[row["Name"]] = f"perhaps not ours, it cannot be read: {error.message}"
+            unread[row["Name"]] = f"perhaps not ours, its tags cannot be read: {error.message}"
             is_ours = True
         if is_ours:
             yield "bucket", row["Name"], ""
     for row in account.pages("secretsmanager", "list_secrets", "SecretList"):
         if _has_tag(of, row.get("Tags", ())):
             yield "secret", row["Name"], row["ARN"]
-    for before in ("", _OF_FUNCTIONS):
+    for before in ("", _FUNCTION_LOG_PREFIX):
         prefix = f"{before}{of.stack_prefix}"
         for row in account.pages("logs", "describe_log_groups", "logGroups", logGroupNamePrefix=prefix):
             if of.owns_stack(row["logGroupName"].removeprefix(before)):
@@ -98,7 +109,7 @@ def _is_tagged(account: Account, of: ResourceNames, bucket: str) -> bool:
     answer = account.find("s3", "get_bucket_tagging", Bucket=bucket) or {}
     if not _has_tag(of, answer.get("TagSet", ())):
         return False
-    # Buckets of all regions are listed, and a deployment of this name may stand in another one.
+    # Buckets of all regions are listed, and another region may have a deployment of the same name.
     where = account.find("s3", "get_bucket_location", Bucket=bucket) or {}
     return (where.get("LocationConstraint") or "us-east-1") == account.region
 
@@ -107,7 +118,7 @@ def _has_tag(of: ResourceNames, tags: Iterable[dict[str, Any]]) -> bool:
     return any(tag["Key"] == DEPLOYMENT_TAG and tag["Value"] == of.prefix for tag in tags)
 
 
-def _remove(kind: str, name: str) -> str:
+def _removal_command(kind: str, name: str) -> str:
     commands = {
         "bucket": f"empty it in the console, all versions; then aws s3api delete-bucket --bucket {name}",
         "secret": f"aws secretsmanager delete-secret --secret-id {name}",

@@ -1,7 +1,7 @@
-"""End all servers of a deployment, note the sizes of its groups, and restore them.
+"""Set the sizes of a deployment's groups to 0, note the former sizes, and restore them.
 
-An operator's commands, the idle timer and the schedule use the same calls; the role of the function allows no
-others.
+The operator's commands and the function of the idle timer and the schedule use the same calls.  The IAM role
+of that function allows no other changes.
 """
 
 from __future__ import annotations
@@ -22,40 +22,52 @@ __all__ = [
     "write_note",
 ]
 
-_SUSPENDED = ("AlarmNotification", "ScheduledActions")
-"""Processes of a parked group: neither an alarm nor a scheduled action starts a server."""
+_SUSPENDED_PROCESSES = ("AlarmNotification", "ScheduledActions")
+"""Auto Scaling processes that are suspended in a parked group, so that no alarm or schedule adds servers."""
 
-# Alarms of one call that switches their actions: the most that AWS takes.
-_ALARMS_OF_A_CALL = 100
+# Most alarms whose actions one call enables or disables: AWS takes no more.
+_MAX_ALARMS_PER_CALL = 100
 
 
 def write_note(account: Account, names: ResourceNames, note: ParkNote) -> None:
-    """Write *note*, in place of an existing one; raises ConfigurationError."""
+    """Store *note* in the SSM parameter, in place of an existing note; raises as `Account.change`."""
     value = msgspec.json.encode(note).decode()
     account.change("ssm", "put_parameter", Name=names.parked, Value=value, Type="String", Overwrite=True)
 
 
 def delete_note(account: Account, names: ResourceNames) -> None:
-    """Delete the note: the deployment is not parked any more.  Raises as `Account.find`."""
+    """Delete the note, so that the deployment counts as not parked; raises the errors of `Account.find`."""
     account.find("ssm", "delete_parameter", Name=names.parked)
 
 
 def silence_alarms(account: Account, names: ResourceNames) -> None:
-    """Disable the actions and notifications of all alarms of the deployment; raises as `Account.find`."""
+    """Disable the actions, and so the notifications, of all alarms of the deployment.
+
+    Raises the errors of `Account.change`.
+    """
     for some in _alarms_of_deployment(account, names):
         account.change("cloudwatch", "disable_alarm_actions", AlarmNames=some)
 
 
 def enable_alarms(account: Account, names: ResourceNames) -> None:
-    """Enable the actions and notifications of all alarms of the deployment; raises as `Account.find`."""
+    """Enable the actions, and so the notifications, of all alarms of the deployment.
+
+    Raises the errors of `Account.change`.
+    """
     for some in _alarms_of_deployment(account, names):
         account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
 
 
 def empty_group(account: Account, group: str) -> None:
-    """Suspend the processes that start servers in *group*, and end its servers; raises as `Account.find`."""
+    """Suspend the processes that add servers to *group*, and set its size to 0, so that its servers drain.
+
+    Raises the errors of `Account.change`.
+    """
     account.change(
-        "autoscaling", "suspend_processes", AutoScalingGroupName=group, ScalingProcesses=list(_SUSPENDED)
+        "autoscaling",
+        "suspend_processes",
+        AutoScalingGroupName=group,
+        ScalingProcesses=list(_SUSPENDED_PROCESSES),
     )
     account.change(
         "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=group,
@@ -64,10 +76,10 @@ def empty_group(account: Account, group: str) -> None:
 
 
 def fill_groups(account: Account, names: ResourceNames, *, least: int = 0) -> None:
-    """Give the groups their noted sizes back, and let them grow again.
+    """Restore the noted sizes of the groups, and resume the processes that add servers.
 
-    The group of the backend servers gets a minimum of *least* or more.  A group whose maximum is not 0 keeps
-    its size.  Raises as `Account.find`.
+    The group of backend servers gets a minimum of at least *least*, but not above its maximum.  A group whose
+    maximum is not 0 keeps its size.  Raises the errors of `Account.change`.
     """
     note = read_note(account, names)
     for name, now in read_sizes(account, names).items():
@@ -81,12 +93,17 @@ def fill_groups(account: Account, names: ResourceNames, *, least: int = 0) -> No
                 MaxSize=size.max_servers,
             )  # fmt: skip
         account.change(
-            "autoscaling", "resume_processes", AutoScalingGroupName=name, ScalingProcesses=list(_SUSPENDED)
+            "autoscaling",
+            "resume_processes",
+            AutoScalingGroupName=name,
+            ScalingProcesses=list(_SUSPENDED_PROCESSES),
         )
 
 
 def _alarms_of_deployment(account: Account, names: ResourceNames) -> list[list[str]]:
-    """Return the names of the deployment's alarms, in portions that one call takes."""
+    """Return the names of the deployment's alarms, in lists of at most `_MAX_ALARMS_PER_CALL`."""
     rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=names.alarm_prefix)
     alarm_names = [str(row["AlarmName"]) for row in rows]
-    return [alarm_names[at : at + _ALARMS_OF_A_CALL] for at in range(0, len(alarm_names), _ALARMS_OF_A_CALL)]
+    return [
+        alarm_names[at : at + _MAX_ALARMS_PER_CALL] for at in range(0, len(alarm_names), _MAX_ALARMS_PER_CALL)
+    ]

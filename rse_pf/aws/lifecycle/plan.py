@@ -1,6 +1,6 @@
-"""Decide by which steps a deployment is put up, parked, resumed or taken down.
+"""Decide by which steps a deployment is created or updated, parked, resumed or removed.
 
-The plan depends only on the resources that exist; a step that was done before may be repeated.
+The plan depends only on the resources that exist; a step that was carried out before may be repeated.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rse_pf.errors import ConfigurationError
 __all__ = ["KEPT", "Action", "Step", "plan_down", "plan_park", "plan_resume", "plan_up", "size_to_restore"]
 
 KEPT = "Data"
-"""The stack that `plan_down` keeps unless the data is deleted, too: maps, logs and the signing key."""
+"""The stack with maps, logs and the signing key; `plan_down` keeps it unless the data is deleted, too."""
 
 Action = Literal[
     "build", "bootstrap", "settle", "deploy", "destroy", "note", "silence", "empty", "await-empty",
@@ -32,7 +32,7 @@ _TEXTS: dict[Action, str] = {
     "note": "note the sizes of the groups",
     "silence": "stop alarms from acting and notifying",
     "empty": "set the size of every group to 0",
-    "await-empty": "wait until the servers have drained and ended",
+    "await-empty": "wait until the servers have drained and are terminated",
     "fill": "restore the sizes of the groups",
     "alert": "let alarms act and notify again",
     "forget": "delete the note of the sizes",
@@ -45,19 +45,23 @@ _TEXTS: dict[Action, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step; *box* names the stack that it concerns."""
+    """One step of a plan.
+
+    *box* is the short name of the stack that the step changes, such as ``Backend``, or empty; *deep* says in
+    the step ``note`` that the deployment is parked deeply.
+    """
 
     action: Action
     box: str = ""
     deep: bool = False
 
     def __str__(self) -> str:
-        """Return a description of the step in one line."""
+        """Return a description of the step for the operator, in one line."""
         return _TEXTS[self.action].format(self.box)
 
 
 def plan_up(deployment: Deployment, *, has_packages: bool) -> list[Step]:
-    """Return the steps that put up what is missing, bring the rest up to date, and end parking."""
+    """Return the steps that create missing stacks, update the others, and resume a parked deployment."""
     steps = [] if has_packages else [Step("build")]
     if not deployment.is_bootstrapped:
         steps.append(Step("bootstrap"))
@@ -70,7 +74,9 @@ def plan_up(deployment: Deployment, *, has_packages: bool) -> list[Step]:
 
 
 def plan_park(deployment: Deployment, *, deep: bool) -> list[Step]:
-    """Return the steps that end all servers and, if *deep*, everything but the data.
+    """Return the steps that drain and terminate all servers and, if *deep*, destroy all stacks but Data.
+
+    A deployment that is parked deeply already stays so, also if *deep* is false.
 
     Raises:
         ConfigurationError: There is no deployment.
@@ -89,7 +95,7 @@ def plan_park(deployment: Deployment, *, deep: bool) -> list[Step]:
 
 
 def plan_resume(deployment: Deployment, *, has_packages: bool) -> list[Step]:
-    """Return the steps that end parking.
+    """Return the steps that resume a parked deployment; of a deeply parked one, those of `plan_up`.
 
     Raises:
         ConfigurationError: The deployment is not parked.
@@ -104,7 +110,7 @@ def plan_resume(deployment: Deployment, *, has_packages: bool) -> list[Step]:
 
 
 def plan_down(deployment: Deployment, *, delete_data: bool) -> list[Step]:
-    """Return the steps that destroy all stacks but `KEPT` and, if *delete_data*, that one and its data."""
+    """Return the steps that destroy all stacks but `KEPT`; if *delete_data*, also `KEPT` with its data."""
     steps = list(_plan_destruction(deployment))
     if deployment.note is not None:
         steps.append(Step("forget"))
@@ -116,9 +122,9 @@ def plan_down(deployment: Deployment, *, delete_data: bool) -> list[Step]:
 
 
 def size_to_restore(saved: GroupSize | None, now: GroupSize) -> GroupSize | None:
-    """Return the size that a group gets back, or None if it keeps the one that it has.
+    """Return *saved* if the group still has the size 0 of a parked group; None if it must keep its size.
 
-    A group whose maximum is not 0 was deployed anew, with newer settings, or has its size back already.
+    A group whose maximum is not 0 was deployed again, with newer settings, or was restored already.
     """
     return saved if saved is not None and now.max_servers == 0 else None
 
@@ -131,5 +137,5 @@ def _plan_destruction(deployment: Deployment) -> Iterator[Step]:
 
 
 def _plan_wait(deployment: Deployment, box: str) -> list[Step]:
-    """Return a step that waits, if an earlier command was ended while AWS changed the stack."""
+    """Return a step that waits, if AWS still changes the stack because of an earlier command; else none."""
     return [Step("settle", box)] if deployment.stacks.get(box, "").endswith("_IN_PROGRESS") else []

@@ -1,6 +1,7 @@
-"""Check that a deployment is gone: list what AWS still has under its tag, and what that costs.
+"""Check that a deployment was removed: list the resources that AWS still has with its tag, and their costs.
 
-The check does not rely on the stacks: it reads the tagging service, and finds by name what cannot be tagged.
+The check does not rely on the stacks: it reads AWS's tagging service, and finds resources without tags by
+their names.
 """
 
 from __future__ import annotations
@@ -15,20 +16,28 @@ from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 
 __all__ = ["KeptResource", "Proof", "prove"]
 
-_CLASSES = (
+# Values of the dimension StorageType whose bucket sizes are added.
+_STORAGE_TYPES = (
     "StandardStorage", "StandardIAStorage", "GlacierInstantRetrievalStorage", "GlacierStorage",
     "IntelligentTieringFAStorage", "IntelligentTieringIAStorage",
 )  # fmt: skip
-# Days that are read back for the size of a bucket: AWS publishes it once a day, up to two days late.
-_SIZE_DAYS = 3
+# Number of days for which sizes of a bucket are read: AWS publishes them once a day, up to two days late.
+_SIZE_WINDOW_DAYS = 3
 _DAY_S = 86400
-_KEPT_SERVICES = {"s3": "bucket", "secretsmanager": "secret"}
-_ENDED = ("terminated", "shutting-down")
+_KEPT_KINDS = {"s3": "bucket", "secretsmanager": "secret"}  # kinds that are kept on purpose, by AWS service
+_TERMINATED_STATES = ("terminated", "shutting-down")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptResource:
-    """A resource that is kept on purpose; ``gb`` is None until AWS has measured the bucket, once a day."""
+    """A bucket or secret that is kept on purpose.
+
+    Attributes:
+        kind: ``bucket`` or ``secret``.
+        name: Name of the resource.
+        gb: Size of a bucket in GB, which AWS measures once a day; None before the first measurement.
+        per_month: Cost of a month; of a bucket without a measurement, 0.
+    """
 
     kind: str
     name: str
@@ -38,14 +47,14 @@ class KeptResource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proof:
-    """The resources that are kept on purpose, and the names of those that should not exist any more."""
+    """The resources that are kept on purpose, and the names (``left``) of those that should not exist."""
 
     kept: tuple[KeptResource, ...]
     left: tuple[str, ...]
 
     @property
     def per_month(self) -> float:
-        """Return what all that is kept costs a month, as far as it is measured."""
+        """Return the cost of a month of all kept resources; buckets that are not measured yet count 0."""
         return sum(each.per_month for each in self.kept)
 
 
@@ -57,14 +66,14 @@ def prove(
     secret_month_price: float,
     now: datetime,
 ) -> Proof:
-    """Return the resources of a deployment that exist at *now*, in UTC; raises as `Account.find`.
+    """Return the resources of a deployment that still exist; raises the errors of `Account.find`.
 
     Args:
-        account: Of the deployment.
-        names: Of its resources.
-        gb_month_price: Of a GB in S3 for a month.
-        secret_month_price: Of a secret for a month.
-        now: In UTC.
+        account: AWS account of the deployment.
+        names: Names of its resources.
+        gb_month_price: Price of a GB in S3 for a month.
+        secret_month_price: Price of a secret for a month.
+        now: The time in UTC.
     """
     tagged = _list_tagged(account, names)
     kept_names = sorted({(_kind_if_kept(arn), _name(arn)) for arn in tagged if _kind_if_kept(arn)})
@@ -72,7 +81,7 @@ def prove(
     remaining |= {
         f"{leftover.kind} {leftover.name}"
         for leftover in find_leftovers(account, names)
-        if leftover.kind not in _KEPT_SERVICES.values() and not any(leftover.name in arn for arn in tagged)
+        if leftover.kind not in _KEPT_KINDS.values() and not any(leftover.name in arn for arn in tagged)
     }
     resources = []
     for kind, name in kept_names:
@@ -87,12 +96,12 @@ def _list_tagged(account: Account, names: ResourceNames) -> set[str]:
         "resourcegroupstaggingapi", "get_resources", "ResourceTagMappingList",
         TagFilters=[{"Key": DEPLOYMENT_TAG, "Values": [names.prefix]}],
     )  # fmt: skip
-    data = names.stack("Data")  # the stack itself costs nothing, and exists as long as the data is kept
+    data = names.stack("Data")  # this stack costs nothing, and exists as long as the data is kept
     return {str(row["ResourceARN"]) for row in rows if f":stack/{data}/" not in str(row["ResourceARN"])}
 
 
 def _kind_if_kept(arn: str) -> str:
-    return _KEPT_SERVICES.get(arn.split(":")[2], "")
+    return _KEPT_KINDS.get(arn.split(":")[2], "")
 
 
 def _name(arn: str) -> str:
@@ -100,7 +109,7 @@ def _name(arn: str) -> str:
 
 
 def _find_ended_servers(account: Account, tagged: set[str]) -> set[str]:
-    """Return the instances that are listed for an hour after their end."""
+    """Return the ARNs of those *tagged* instances that are terminated; AWS lists them for another hour."""
     instances = {arn.rpartition("/")[2]: arn for arn in tagged if ":instance/i-" in arn}
     if not instances:
         return set()
@@ -112,13 +121,13 @@ def _find_ended_servers(account: Account, tagged: set[str]) -> set[str]:
         instance["InstanceId"]
         for row in rows
         for instance in row["Instances"]
-        if instance["State"]["Name"] not in _ENDED
+        if instance["State"]["Name"] not in _TERMINATED_STATES
     }
     return {arn for name, arn in instances.items() if name not in alive}
 
 
 def _gigabytes(account: Account, bucket: str, now: datetime) -> float | None:
-    """Return the size of a bucket as AWS measures it once a day; None before the first measurement."""
+    """Return the last size of a bucket in GB, which AWS measures once a day; None before the first one."""
     queries = [
         {
             "Id": f"q{at}",
@@ -130,11 +139,11 @@ def _gigabytes(account: Account, bucket: str, now: datetime) -> float | None:
                 "Period": _DAY_S, "Stat": "Average",
             },
         }
-        for at, kind in enumerate(_CLASSES)
+        for at, kind in enumerate(_STORAGE_TYPES)
     ]  # fmt: skip
     rows = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults", MetricDataQueries=queries,
-        ScanBy="TimestampDescending", StartTime=now - timedelta(days=_SIZE_DAYS), EndTime=now,
+        ScanBy="TimestampDescending", StartTime=now - timedelta(days=_SIZE_WINDOW_DAYS), EndTime=now,
     )  # fmt: skip
     newest = [row["Values"][0] for row in rows if row["Values"]]
     return sum(newest) / 1e9 if newest else None

@@ -1,7 +1,7 @@
-"""Delete resources that outlive the stacks: forgotten ones and, if the operator agrees, the data.
+"""Delete resources that remain after the stacks: forgotten ones and, if the operator agrees, the data.
 
-Object lock is respected: an audit log that is still locked stays, and so does its bucket.  AWS can restore a
-secret for 30 days after its deletion.
+An audit log that object lock still protects stays, and so does its bucket.  AWS can restore a secret for
+30 days after its deletion.
 """
 
 from __future__ import annotations
@@ -17,21 +17,26 @@ from rse_pf.errors import ConfigurationError
 
 __all__ = ["erase_data", "sweep"]
 
-# Objects of one call that deletes: the most that S3 takes.
-_OBJECTS_OF_A_CALL = 1000
+# Most objects that one call deletes: S3 takes no more.
+_MAX_OBJECTS_PER_CALL = 1000
 
 
 def sweep(account: Account, names: ResourceNames) -> None:
-    """Delete the resources that no stack owns and that are not kept on purpose; raises as `Account.find`."""
+    """Delete log groups, alarms, volumes and network interfaces of the deployment that no stack contains.
+
+    Raises the errors of `Account.find`.
+    """
     for leftover in find_leftovers(account, names):
-        if leftover.kind in _SWEPT and not leftover.unread:
-            service, method, argument = _SWEPT[leftover.kind]
+        if leftover.kind in _DELETE_CALLS and not leftover.unread:
+            service, method, argument = _DELETE_CALLS[leftover.kind]
             value: Any = [leftover.name] if argument == "AlarmNames" else leftover.name
             account.find(service, method, **{argument: value})
 
 
 def erase_data(account: Account, names: ResourceNames, *, audit_days: int) -> list[str]:
-    """Delete the buckets and secrets that no stack owns; return a line for each bucket that has to stay.
+    """Delete the deployment's buckets and secrets that no stack contains.
+
+    Return a line for each bucket that has to stay because object lock protects audit logs in it.
 
     Raises:
         ConfigurationError: AWS refused.
@@ -44,7 +49,7 @@ def erase_data(account: Account, names: ResourceNames, *, audit_days: int) -> li
         if leftover.kind == "secret":
             account.find("secretsmanager", "delete_secret", SecretId=leftover.name)
         elif leftover.kind == "bucket":
-            has_lock = _AUDIT_LOGS in leftover.name.removeprefix(names.stack("Data").lower())
+            has_lock = _AUDIT_LOGS_NAME in leftover.name.removeprefix(names.stack("Data").lower())
             locked, until = _empty_bucket(account, leftover.name, audit_days, has_lock=has_lock)
             if locked:
                 logs = f"object lock keeps {locked} audit logs, the last until {until:%Y-%m-%d}"
@@ -54,7 +59,8 @@ def erase_data(account: Account, names: ResourceNames, *, audit_days: int) -> li
     return refused
 
 
-_SWEPT = {
+# Service, method and argument of the call that deletes a resource, by its kind.
+_DELETE_CALLS = {
     "log group": ("logs", "delete_log_group", "logGroupName"),
     "alarm": ("cloudwatch", "delete_alarms", "AlarmNames"),
     "volume": ("ec2", "delete_volume", "VolumeId"),
@@ -63,27 +69,29 @@ _SWEPT = {
 
 
 def _deletion_order(leftover: Leftover) -> tuple[bool, str]:
-    """Return a key that sorts the bucket into which the others write to the end."""
+    """Return a sort key that puts the bucket of access logs last, because the other buckets write into it."""
     return "accesslogs" in leftover.name, leftover.name
 
 
 def _empty_bucket(account: Account, bucket: str, audit_days: int, *, has_lock: bool) -> tuple[int, datetime]:
-    """Delete every version of every object; return how many are locked, and until when the last one is.
+    """Delete every version of every object in *bucket*.
 
-    S3 answers alike for a locked object and for one that the account may not delete; *has_lock* decides.
+    Return the number of versions that are locked, and the time (UTC) until which the last of them is locked.
+    S3 gives the same error for a locked object and for one that the account may not delete: it means a lock
+    if *has_lock*, else ConfigurationError is raised.
     """
     locked, until = 0, datetime.min
     for page in _pages_of_versions(account, bucket):
         dates = {row["Key"]: row["LastModified"] for row in reversed(page)}
-        for at in range(0, len(page), _OBJECTS_OF_A_CALL):
+        for at in range(0, len(page), _MAX_OBJECTS_PER_CALL):
             some = [
                 {"Key": row["Key"], "VersionId": row["VersionId"]}
-                for row in page[at : at + _OBJECTS_OF_A_CALL]
+                for row in page[at : at + _MAX_OBJECTS_PER_CALL]
             ]
             deletion = {"Objects": some, "Quiet": True}
             answer = account.find("s3", "delete_objects", Bucket=bucket, Delete=deletion)
             for error in (answer or {}).get("Errors", ()):
-                if not (has_lock and error["Code"] in _LOCKED):
+                if not (has_lock and error["Code"] in _LOCK_ERRORS):
                     raise ConfigurationError(
                         f"AWS refuses to delete objects of {bucket}: {error['Code']}",
                         hint="check your account's permissions, or sign in again",
@@ -94,9 +102,9 @@ def _empty_bucket(account: Account, bucket: str, audit_days: int, *, has_lock: b
     return locked, until
 
 
-_LOCKED = ("AccessDenied", "AccessForbidden")
-_AUDIT_LOGS = "auditlogs"
-"""In the name of the only bucket with object lock, after that of its stack."""
+_LOCK_ERRORS = ("AccessDenied", "AccessForbidden")  # error codes of S3 for an object that is locked
+_AUDIT_LOGS_NAME = "auditlogs"
+"""Part of the name of the only bucket with object lock, after the name of its stack."""
 
 
 def _pages_of_versions(account: Account, bucket: str) -> Iterator[list[dict[str, Any]]]:

@@ -1,13 +1,13 @@
 """The audit logs of a cloud: servers upload them in pieces while they write, and an operator fetches them.
 
-The new lines of a file become one object, a piece, ``audit/INSTANCE/WHO.TIME.DIGEST.jsonl``: TIME is that of
-its first entry in Unix seconds, DIGEST the beginning of its sha256.  `Shipper` writes each name once, and
-reads and deletes nothing in the bucket, where Object Lock keeps what was written.  After a crash of the
-agent pieces may overlap, but no entry is missing.
+The new lines of a log file become one object, a piece, ``audit/INSTANCE/WHO.TIME.DIGEST.jsonl``.  WHO is the
+process that writes the log, TIME the time of the first entry in Unix seconds, DIGEST the beginning of the
+piece's sha256.  `Shipper` writes each name once, and reads and deletes nothing in the bucket, where Object
+Lock protects the pieces.  After a crash of the agent pieces may overlap, but no entry is missing.
 
-`fetch_audit` only reads.  It joins the pieces of each writer to one file; of equal lines in several
-pieces it keeps one.  A log is named after its instance: ``INSTANCE`` is the backend server's own,
-``INSTANCE_WHO`` belongs to another writer on that instance.
+`fetch_audit` only reads.  It joins the pieces of each writer to one file; of equal lines in several pieces it
+keeps one.  The file of a backend server is named ``INSTANCE``, that of another writer on the same instance
+``INSTANCE_WHO``.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["Shipper", "fetch_audit", "open_audit_archive"]
 
-_DIGEST_LETTERS = 32
-_MAX_BYTES = 1 << 23
-"""Of one piece: it uploads in about a second, and the agent holds one of them in memory."""
+_DIGEST_LETTERS = 32  # hexadecimal digits of a piece's sha256 in its name: 128 bits exclude collisions
+_MAX_PIECE_BYTES = 1 << 23
+"""Largest size of a piece: it uploads in about a second, and the agent holds one piece in memory."""
 _PIECE = re.compile(
     rf"{AUDIT_PREFIX}/(?P<instance>[A-Za-z0-9_-]{{1,64}})/"
     rf"(?P<who>[A-Za-z0-9_-]{{1,64}})\.\d{{12}}\.[0-9a-f]{{{_DIGEST_LETTERS}}}\.jsonl"
@@ -43,18 +43,19 @@ _PIECE = re.compile(
 
 
 class Shipper:
-    """Uploads the logs in one folder."""
+    """Uploads the audit logs in one folder to the audit bucket, in pieces."""
 
     def __init__(
         self, folder: Path, store: ObjectStore, *, marks_file: Path, instance: Callable[[], str]
     ) -> None:
-        """Make a shipper; nothing is read.
+        """Describe the shipper; nothing is read yet.
 
         Args:
-            folder: Where the logs are written.
-            store: The bucket; the shipper only writes new names.
-            marks_file: Where it keeps how many bytes of each file, by its inode, were uploaded.
-            instance: Returns the name of this machine.
+            folder: Folder into which the servers write their logs.
+            store: The audit bucket, in which only new names are written.
+            marks_file: File in which the shipper keeps how many bytes of each log file were uploaded, by the
+                file's inode.
+            instance: Returns the instance id of this machine.
         """
         self._folder = folder
         self._store = store
@@ -62,16 +63,17 @@ class Shipper:
         self._instance = instance
 
     def ship(self) -> int:
-        """Upload new entries; return the number of pieces.
+        """Upload all entries that were not uploaded yet; return the number of pieces.
 
         Raises:
-            StoreError: The bucket refused a piece, which the next call uploads.
+            StoreError: The bucket refused a piece; the next call uploads that piece again.
             OSError: A log cannot be read.
         """
         marks, count = self._marks(), 0
         for who in log_names(self._folder):
             for path in log_files(self._folder, who):
-                with contextlib.suppress(FileNotFoundError):  # it was renamed; the next call uploads the rest
+                # The file may have been renamed meanwhile; then the next call uploads its rest.
+                with contextlib.suppress(FileNotFoundError):
                     count += self._ship_file(who, path, marks)
         return count
 
@@ -80,10 +82,10 @@ class Shipper:
         with path.open("rb") as file:
             about = os.fstat(file.fileno())
             inode = str(about.st_ino)
-            if marks.get(inode, 0) > about.st_size:  # another file that got the inode of a removed one
+            if marks.get(inode, 0) > about.st_size:  # this is a new file with the inode of a removed file
                 marks[inode] = 0
             while data := _read_lines(file, marks.get(inode, 0)):
-                # Only the same bytes take a name: they arrived before, and their mark was not written.
+                # A name that exists has the same bytes: they were uploaded before, without saving the mark.
                 with contextlib.suppress(Conflict):
                     self._store.compare_and_swap(_piece_name(self._instance(), who, data), None, data)
                 marks[inode] = marks.get(inode, 0) + len(data)
@@ -92,7 +94,10 @@ class Shipper:
         return count
 
     def _marks(self) -> dict[str, int]:
-        """Return the marks; when they cannot be read, everything is uploaded again."""
+        """Return the number of uploaded bytes of each file, by inode.
+
+        If the marks file is missing or cannot be read, return none, so that all logs are uploaded again.
+        """
         try:
             return msgspec.json.decode(self._marks_file.read_bytes(), type=dict[str, int])
         except (FileNotFoundError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -107,7 +112,7 @@ def open_audit_archive(account: Account, names: ResourceNames) -> S3Store:
 
 
 def fetch_audit(store: ObjectStore, folder: Path) -> None:
-    """Write the logs in *store* as files into the new *folder*; raises StoreError."""
+    """Write the audit logs in *store* into *folder*, one file for each writer; raises StoreError."""
     pieces: dict[str, list[str]] = {}
     for info in store.list(f"{AUDIT_PREFIX}/"):
         match = _PIECE.fullmatch(info.name)
@@ -117,7 +122,7 @@ def fetch_audit(store: ObjectStore, folder: Path) -> None:
             pieces.setdefault(who, []).append(info.name)
     folder.mkdir(parents=True, exist_ok=True)
     for who, names in pieces.items():
-        known: set[bytes] = set()  # an agent that lost its marks uploads lines again, in other pieces
+        known: set[bytes] = set()  # digests of lines: an agent without its marks uploads lines again
         with (folder / f"{who}.jsonl").open("wb") as file:
             for name in sorted(names):
                 lines = store.get(name).splitlines(keepends=True)
@@ -133,6 +138,6 @@ def _piece_name(instance: str, who: str, data: bytes) -> str:
 
 
 def _read_lines(file: BinaryIO, offset: int) -> bytes:
-    """Return at most one piece of whole lines from *offset* on."""
-    data = os.pread(file.fileno(), _MAX_BYTES, offset)
+    """Return the whole lines of *file* from *offset* on, at most `_MAX_PIECE_BYTES`."""
+    data = os.pread(file.fileno(), _MAX_PIECE_BYTES, offset)
     return data[: data.rfind(b"\n") + 1]

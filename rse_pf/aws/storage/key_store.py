@@ -1,8 +1,9 @@
 """The signing keys of a cloud: private keys in one secret, public keys as a JWKS in the artifact bucket.
 
-Two keys overlap in a rotation: servers fetch the new one before anything is signed with it, and the old one
-stays until its last token has expired.  No private key is in an error message or a log line, and a public key
-is published only after its private key is stored.  `rse-pf token --cloud` reads the secret; servers never do.
+Two keys overlap in a rotation: servers fetch the new public key before tokens are signed with the new key,
+and the old one stays until its last token has expired.  No private key appears in an error message or a log
+line, and a public key is published only after its private key was stored.  `rse-pf token --cloud` reads the
+secret; servers never do.
 """
 
 from __future__ import annotations
@@ -24,19 +25,23 @@ _MAKE_ONE = "make one with rse-pf token init --cloud"
 
 
 def spread_s(settings: PlatformSettings) -> float:
-    """Return how long it takes until every server and function has fetched a new key set."""
+    """Return the seconds after which every server and function has fetched a new key set."""
     return 2.0 * settings.scaling.period_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyRing:
-    """The keys, oldest first, each with the Unix time from which it may sign."""
+    """The signing keys, oldest first, each with the Unix time (s) from which it may sign tokens."""
 
     keys: tuple[tuple[SigningKey, float], ...]
 
     @classmethod
     def from_json(cls, text: str) -> KeyRing | None:
-        """Return the ring that `to_json` wrote; None for the initial value of CloudFormation."""
+        """Return the ring in *text*, which `to_json` wrote; None if the secret holds no keys yet.
+
+        Raises:
+            ConfigurationError: The text holds keys that cannot be read.
+        """
         try:
             document = json.loads(text)
             rows = document["keys"]
@@ -51,25 +56,25 @@ class KeyRing:
         return cls(keys=keys) if keys else None
 
     def to_json(self) -> str:
-        """Return the ring with its private keys, for the secret only."""
+        """Return the ring with its private keys as JSON text, which must be stored only in the secret."""
         rows = [{"jwk": json.loads(key.to_json()), "from_s": from_s} for key, from_s in self.keys]
         return json.dumps({"keys": rows})
 
     def key_set(self) -> KeySet:
-        """Return the public keys."""
+        """Return the public keys of the ring."""
         halves = {key.key_id: key.key_set().get(key.key_id) for key, _ in self.keys}
         return KeySet({name: half for name, half in halves.items() if half is not None})
 
     def signer(self, now: float) -> SigningKey:
-        """Return the newest key that may sign at *now*, in Unix seconds."""
+        """Return the newest key that may sign at *now* (Unix s); the oldest key if none may sign yet."""
         may = [key for key, from_s in self.keys if from_s <= now]
         return may[-1] if may else self.keys[0][0]
 
     def rotated(self, key: SigningKey, *, now: float, settings: PlatformSettings) -> KeyRing:
-        """Return the newest key and *key*, which signs when every server has fetched it.
+        """Return a ring of the newest key and the new *key*, which signs `spread_s` after *now* (Unix s).
 
         Raises:
-            ConfigurationError: The previous rotation is not over yet.
+            ConfigurationError: Tokens of the key that would be dropped are still valid.
         """
         _, from_s = self.keys[-1]
         old_tokens_over = from_s + settings.auth.token_ttl_s + settings.auth.leeway_s
@@ -81,11 +86,13 @@ class KeyRing:
         return KeyRing(keys=(self.keys[-1], (key, now + spread_s(settings))))
 
     def retired(self, *, now: float, force: bool = False) -> KeyRing:
-        """Return a ring of the newest key only, which signs from *now* on; servers stop trusting the others.
+        """Return a ring of the newest key only, which signs from *now* (Unix s) on.
+
+        Servers then refuse the tokens of the other keys.
 
         Raises:
-            ConfigurationError: There is no other key; or servers may still lack the newest key, so that
-                robots with valid tokens would be refused, and *force* is false.
+            ConfigurationError: There is only one key; or *force* is false and servers may not have fetched
+                the newest key yet, so that they would refuse all robots for some time.
         """
         if len(self.keys) == 1:
             raise ConfigurationError(
@@ -110,23 +117,26 @@ class KeyStore:
         self._bucket = S3Store(account.client("s3"), bucket)
 
     def read(self) -> KeyRing | None:
-        """Return the ring; None if no key was made yet.
+        """Read and return the ring in the secret; None if no key was made yet.
 
         Raises:
-            ConfigurationError: AWS refused, or the secret holds broken keys.
+            ConfigurationError: AWS refused, or the secret holds keys that cannot be read.
+            StoreError: AWS does not answer.
         """
         secret = self._account.find("secretsmanager", "get_secret_value", SecretId=self._secret)
         return None if secret is None else KeyRing.from_json(secret["SecretString"])
 
     def ring(self) -> KeyRing:
-        """Return the ring; raises ConfigurationError if there is none."""
+        """Read and return the ring in the secret; raises ConfigurationError if no key was made yet."""
         ring = self.read()
         if ring is None:
             raise ConfigurationError("this cloud has no signing key yet", hint=_MAKE_ONE)
         return ring
 
     def write(self, ring: KeyRing) -> None:
-        """Store *ring*, then publish its public keys; after a crash between the two, call `publish`.
+        """Store *ring* in the secret, then publish its public keys.
+
+        After a crash between the two steps, `publish` completes them.
 
         Raises:
             NotFound: There is no such secret.
@@ -140,7 +150,7 @@ class KeyStore:
         self.publish(ring)
 
     def access_control_store(self) -> AccessControlStore:
-        """Return the roster and the deny list in the bucket of the public keys; agents fetch both."""
+        """Return the store of roster and deny list in the artifact bucket, from where agents fetch both."""
         return AccessControlStore(self._bucket)
 
     def published(self) -> KeySet:
@@ -148,7 +158,10 @@ class KeyStore:
         return KeySet.from_json(self._bucket.get(KEYS_NAME).decode())
 
     def publish(self, ring: KeyRing) -> None:
-        """Write the public keys, which servers fetch within `spread_s`; create roster and deny list."""
+        """Write the public keys of *ring* to the bucket; servers fetch them within `spread_s`.
+
+        If roster or deny list do not exist, create empty ones before.
+        """
         self.access_control_store().create_missing()
         self._bucket.put(KEYS_NAME, ring.key_set().to_json().encode())
 

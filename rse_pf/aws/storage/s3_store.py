@@ -1,8 +1,9 @@
 """An object store in one S3 bucket, with the contract of `rse_pf.storage.object_store.ObjectStore`.
 
-A compare-and-swap is a conditional write of S3, so only one of two servers succeeds.  A presigned URL fixes
-name, length and sha256 of what may be stored, so a robot can upload exactly these bytes with it.  Names that
-the platform would not write are not listed; no call lasts longer than `rse_pf.aws.clients` allows.
+A compare-and-swap is a conditional write of S3, so that only one of two servers succeeds.  A presigned URL
+fixes name, length and sha256 of the object that may be stored, so that a robot can upload only these bytes
+with it.  Objects whose names the platform would not write are not listed.  The timeouts and retries are those
+of `rse_pf.aws.clients`.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from rse_pf.storage.object_store import ObjectInfo, ObjectStore, Usage, check_na
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
 
-# HTTP statuses of S3.
+# HTTP statuses of S3's answers.
 _NOT_FOUND = 404
 _PRECONDITION_FAILED = 412
-_RANGE_OUTSIDE = 416
-# Size of the parts of a large object: S3 takes 5 MiB or more, and one part is held in memory.
+_RANGE_NOT_SATISFIABLE = 416
+# Least size of the parts of a large object: S3 takes 5 MiB or more, and one or two parts are held in memory.
 _PART_BYTES = 8 << 20
-_FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
-_ARCHIVED = "InvalidObjectState"
+_FULL_CODES = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}  # error codes that mean "no space"
+_ARCHIVED_CODE = "InvalidObjectState"  # error code for an object that S3 must restore before it can be read
 _RENEW = "renew the AWS credentials of this machine: sign in again, or give it a role"
-_REFUSED = {
+_REFUSAL_HINTS = {
     "NoSuchBucket": "correct data.store, or deploy the data stack",
     "RequestTimeTooSkewed": "set the clock of this machine: S3 accepts at most 15 minutes of difference",
     **dict.fromkeys(
@@ -43,34 +44,39 @@ _REFUSED = {
         _RENEW,
     ),
 }
-"""Error code of S3 to the hint; every other code gets a hint at the policies."""
+"""The hint of the error by S3's error code; other codes get a hint to check the policies."""
 
 
 def open_bucket(bucket: str, region: str) -> S3Store:
-    """Return the store in *bucket* without a call to AWS; raises MissingExtra."""
+    """Return the store in *bucket*, without a call to AWS; raises MissingExtra if boto3 is not installed."""
     return S3Store(make_client("s3", region), bucket)
 
 
 def open_data_store(settings: PlatformSettings) -> ObjectStore:
-    """Return the store of ``data.store``, which may be a bucket; raises UsageError or MissingExtra."""
+    """Return the store that ``data.store`` names: a folder, memory, or ``s3:BUCKET``.
+
+    Raises:
+        UsageError: ``data.store`` names no store.
+        MissingExtra: It names a bucket, and boto3 is not installed.
+    """
     return open_store(settings.data.store, {"s3": lambda bucket: open_bucket(bucket, settings.cloud.region)})
 
 
 class S3Store:
-    """Objects of one bucket."""
+    """The objects of one S3 bucket, as an `ObjectStore`."""
 
     def __init__(self, client: Any, bucket: str) -> None:
         self._client = client
         self._bucket = bucket
         self._has_listed = False
-        """Whether a list of the bucket succeeded, so that a missing object is no missing bucket."""
+        """Whether a list of the bucket succeeded, so that "not found" cannot mean a missing bucket."""
 
     def get(self, name: str) -> bytes:
-        """Return the object; raises NotFound, or Archived if a rule of the bucket has archived it."""
+        """Return the bytes of an object; raises NotFound, or Archived if S3 must restore the object first."""
         return self._read(name)[0]
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return at most *length* bytes from *start* on; raises NotFound."""
+        """Return at most *length* bytes of an object from *start* on; b"" beyond its end; raises NotFound."""
         from botocore.exceptions import ClientError
 
         if length <= 0:
@@ -80,16 +86,19 @@ class S3Store:
             try:
                 return self._get(check_name(name), Range=f"bytes={start}-{start + length - 1}")[0]
             except ClientError as error:
-                if status_of(error) == _RANGE_OUTSIDE:
+                if status_of(error) == _RANGE_NOT_SATISFIABLE:
                     return b""
                 raise
 
     def put(self, name: str, data: bytes) -> None:
-        """Store the object durably; raises StoreFull."""
+        """Store *data* as the object *name*, durably; raises StoreFull or another StoreError."""
         self._write(check_name(name), data)
 
     def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
-        """Store the object durably, in parts of `_PART_BYTES`; if *pieces* raises an error, store nothing."""
+        """Store the joined *pieces* as one object, durably, by an upload in parts if they are large.
+
+        If *pieces* raises an error, nothing is stored, and the error is raised.
+        """
         parts = _join_pieces(pieces, _PART_BYTES)
         first, second = next(parts, b""), next(parts, None)
         if second is None:
@@ -112,11 +121,12 @@ class S3Store:
             raise
 
     def head(self, name: str) -> ObjectInfo:
-        """Return size and name; raises NotFound."""
+        """Return size and name of an object; raises NotFound."""
         try:
             answer = self._ask(name, "head_object", Key=check_name(name))
         except (NotFound, StoreRefused) as error:
-            # The answer to HEAD has no body, and so no code: a list names the cause, as a missing bucket.
+            # S3's answer to HEAD has no body and so no error code.  A list raises the cause, if there is
+            # one, such as a missing bucket.
             if isinstance(error, StoreRefused) or not self._has_listed:
                 self._ask(name, "list_objects_v2", Prefix=name, MaxKeys=1)
                 self._has_listed = True
@@ -127,28 +137,28 @@ class S3Store:
         """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
         for page in self._pages(prefix, **({"StartAfter": after} if after else {})):
             for row in page.get("Contents", ()):
-                with contextlib.suppress(StoreError):  # a name that the platform did not write
+                with contextlib.suppress(StoreError):  # skips names that the platform would not write
                     yield ObjectInfo(name=check_name(row["Key"]), size=int(row["Size"]))
 
     def folders(self, prefix: str) -> Iterator[str]:
-        """Yield the parts of names between *prefix* and the next slash, sorted."""
+        """Yield the names of the folders directly below *prefix*, sorted: the text up to the next slash."""
         for page in self._pages(prefix, Delimiter="/"):
             for row in page.get("CommonPrefixes", ()):
                 yield str(row["Prefix"])[len(prefix) : -1]
 
     def usage(self, prefix: str) -> Usage:
-        """Return the usage of the objects below *prefix*, of which all are listed."""
+        """Return the number and the charged bytes of all objects below *prefix*; all are listed for this."""
         return usage_of(self.list(prefix))
 
     def delete(self, name: str) -> None:
-        """Remove the object; a missing one is no error."""
+        """Remove the object; a missing object is no error."""
         with contextlib.suppress(NotFound):
             self._ask(name, "delete_object", Key=check_name(name))
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected* (None: is missing); raises Conflict.
+        """Store *data* if the object still holds *expected* (None: it does not exist), else raise Conflict.
 
-        When the answer to a successful write is lost, the retry finds its own data and succeeds, too.
+        If S3's answer to a successful write was lost, the retry finds its own data, which is no conflict.
         """
         check_name(name)
         condition = {"IfNoneMatch": "*"}
@@ -163,13 +173,13 @@ class S3Store:
         self._write(name, data, **condition)
 
     def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
-        """Return a URL and the headers with which exactly these bytes may be PUT there.
+        """Return a URL and headers for one PUT that stores the object, without credentials; no call is made.
 
         Args:
             name: Name of the object.
-            size: Its length in bytes.
-            sha256: Its digest in hex; S3 refuses other bytes.
-            ttl_s: The address is good for so long.
+            size: Length of the object in bytes.
+            sha256: Digest of the object in hexadecimal; S3 refuses other bytes.
+            ttl_s: Validity of the URL in seconds.
         """
         checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
         url = self._client.generate_presigned_url(
@@ -183,7 +193,7 @@ class S3Store:
         return str(url), {"Content-Length": str(size), "x-amz-checksum-sha256": checksum}
 
     def presigned_get(self, name: str, *, ttl_s: int) -> str:
-        """Return an address from which the object may be read for *ttl_s* seconds."""
+        """Return a URL from which the object may be read without credentials for *ttl_s* seconds."""
         place = {"Bucket": self._bucket, "Key": check_name(name)}
         return str(self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=ttl_s))
 
@@ -231,7 +241,7 @@ class S3Store:
 
 
 def _join_pieces(pieces: Iterator[bytes], size: int) -> Iterator[bytes]:
-    """Yield what *pieces* hold in parts of at least *size* bytes, the last one excepted."""
+    """Join *pieces* and yield them in parts of at least *size* bytes; the last part may be shorter."""
     part = bytearray()
     for piece in pieces:
         part += piece
@@ -250,19 +260,19 @@ def _raise_store_errors(name: str) -> Iterator[None]:
         yield
     except ClientError as error:
         code = error_code(error)
-        if code == _ARCHIVED:
+        if code == _ARCHIVED_CODE:
             raise Archived(
                 f"{name!r} is archived and cannot be read now",
                 hint=f"restore it: aws s3api restore-object --bucket BUCKET --key {name} "
                 "--restore-request Days=7",
             ) from error
-        if status_of(error) == _NOT_FOUND and code not in _REFUSED:
+        if status_of(error) == _NOT_FOUND and code not in _REFUSAL_HINTS:
             raise NotFound(f"no object named {name!r}") from error
         if status_of(error) == _PRECONDITION_FAILED:
             raise _conflict_error(name) from error
-        if code in _FULL:
+        if code in _FULL_CODES:
             raise StoreFull(f"no space for {name!r}", hint="free some space") from error
-        hint = _REFUSED.get(code, "check the role's policy and the bucket's")
+        hint = _REFUSAL_HINTS.get(code, "check the role's policy and the bucket's")
         what = "the bucket does not exist" if code == "NoSuchBucket" else f"S3 refuses {name!r}: {code}"
         raise StoreRefused(what, hint=hint) from error
 
