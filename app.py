@@ -20,10 +20,10 @@ from stacks.serverless_stack import ServerlessStack
 
 
 def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, cdk.Stack]:
-    """Add the five stacks to *app*, with the packages in the folder *assets*.
+    """Add the five stacks to *app*, with the packages in the folder *assets*; return them by name.
 
-    They share no objects: values pass through `stacks.values`, and the dependencies below only say which
-    stack is deployed before which.
+    The stacks share no CDK objects: values pass from one to another by SSM parameters (`stacks.values`), and
+    the dependencies below only say which stack is deployed before which.
     """
     names, env = ResourceNames(settings.cloud.name), cdk.Environment(region=settings.cloud.region)
 
@@ -45,7 +45,7 @@ def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, c
             reader.add_stack_dependency(provider)
     stacks: list[cdk.Stack] = [network, data, backend, serverless, observability]
     for stack in stacks:
-        # Parameters are found by their names; emulators take tags of theirs in another form than AWS.
+        # SSM parameters get no tag: they are found by name, and emulators take their tags in another form.
         untagged = ["AWS::SSM::Parameter"]
         cdk.Tags.of(stack).add(DEPLOYMENT_TAG, names.prefix, exclude_resource_types=untagged)
         cdk.CfnOutput(stack, "Settings", value=settings.digest(), description="digest of the settings")
@@ -53,7 +53,10 @@ def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, c
 
 
 def check_context(given: dict[str, Any], written: dict[str, Any]) -> None:
-    """Raise SettingsError if a key of *given*, other than the CDK's own, differs from cdk.json: *written*."""
+    """Raise SettingsError if a key of the context *given* has another value in *written*, that of cdk.json.
+
+    Keys of the CDK itself, which contain ``:`` or begin with ``@``, are ignored.
+    """
     for name, value in given.items():
         if ":" not in name and not name.startswith("@") and written.get(name) != value:
             hint = 'write settings into cdk.json, context."rse-pf", and leave -c out'
@@ -61,16 +64,16 @@ def check_context(given: dict[str, Any], written: dict[str, Any]) -> None:
 
 
 def settings_file(given: dict[str, Any], root: Path) -> Path:
-    """Return the file that the context `SETTINGS_CONTEXT` names, or cdk.json next to this program."""
+    """Return the settings file that the context *given* names (`SETTINGS_CONTEXT`), or cdk.json in *root*."""
     named = given.get(SETTINGS_CONTEXT)
     return Path(named) if named else root / "cdk.json"
 
 
 def main() -> int:
-    """Synthesise; print an error and its hint in two lines, and return 2, if that is not possible."""
+    """Synthesise all stacks and return 0; on an error print it with its hint in two lines and return 2."""
     root = Path(__file__).parent
     try:
-        load_settings(root / "cdk.json")  # for its one-line errors
+        load_settings(root / "cdk.json")  # reports invalid JSON as an error of two lines, not as a traceback
         written = json.loads((root / "cdk.json").read_text(encoding="utf-8")).get("context", {})
         app = cdk.App(context=written)
         given = dict(app.node.get_all_context())

@@ -1,1 +1,1 @@
-"""The paper's Fig. 2 on AWS: one construct for each box, five stacks that hold them."""
+"""The platform on AWS as CDK code: one construct for each box of the paper's Fig. 2, in five stacks."""

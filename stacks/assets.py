@@ -1,6 +1,6 @@
-"""Copy the packages that `make assets` built, and add settings and boot files.
+"""Copy the packages that `make assets` built, and add the settings and the boot files.
 
-Nothing is built here: synthesis only copies and hashes what it finds.
+Nothing is built here: the synthesis only copies and hashes the packages.
 """
 
 from __future__ import annotations
@@ -19,24 +19,26 @@ __all__ = ["ENVIRONMENT_FILE", "SERVERS", "SETTINGS_FILE", "SUMS_FILE", "staged"
 SETTINGS_FILE = "settings.json"
 SUMS_FILE = "SHA256SUMS"
 SERVERS = "servers"
-"""The folder of the archives that a backend server unpacks."""
+"""Name of the package of the backend servers: the folder of the archives that a server unpacks."""
 ENVIRONMENT_FILE = "environment.json"
-"""In that folder: the Python that the archives are for, and the digests of our sources in them."""
+"""File in the package `SERVERS` with the Python version of the archives, and the digests of our sources."""
 _BOOT = Path(__file__).parent / "boot"
-_IN_USER_DATA = "first_boot.py"
+_USER_DATA_SCRIPT = "first_boot.py"  # not in the package, because the launch template holds it as user data
 _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGE = "rse_pf"
 
 
 def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> Path:
-    """Return a copy of the folder *name* of *assets* below *into*, with the merged settings inside.
+    """Copy the package *name* from the folder *assets* into the folder *into*, and add the merged settings.
 
-    The settings file has the form of cdk.json, so that `rse-pf --settings` reads it.  The package of the
-    servers gets the boot files too, and a list of all sums for `first_boot.py`; of the settings it holds only
-    those that a server reads, so that no other change replaces servers.
+    Return the folder of the copy.  The settings file has the form of cdk.json, so that `rse-pf --settings`
+    reads it.  The package of the servers also gets the boot files, and the list of all sha256 sums that
+    `first_boot.py` checks.  It holds only those settings that a server reads, so that a change of another
+    setting does not replace servers.
 
     Raises:
-        ConfigurationError: The folder is missing, empty, cannot be read, or holds other sources than these.
+        ConfigurationError: The package is missing, empty, cannot be read, or was built of other sources than
+            those of this checkout.
     """
     source, target = assets / name, into / name
     chosen = server_settings(settings) if name == SERVERS else settings.to_dict()
@@ -51,19 +53,22 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
     (target / SETTINGS_FILE).write_text(json.dumps(document, sort_keys=True) + "\n", encoding="utf-8")
     if name == SERVERS:
         for file in sorted(_BOOT.iterdir()):
-            if file.is_file() and file.name != _IN_USER_DATA:
+            if file.is_file() and file.name != _USER_DATA_SCRIPT:
                 shutil.copyfile(file, target / file.name)
         (target / SUMS_FILE).write_text(sums_text(target), encoding="utf-8")
     return target
 
 
 def sums_digest(package: Path) -> str:
-    """Return the sha256 of a staged package's list of sums, which covers every byte of the package."""
+    """Return the sha256 of the list of sums in *package*; the list covers every byte of the package."""
     return hashlib.sha256((package / SUMS_FILE).read_bytes()).hexdigest()
 
 
 def _check_fresh(packages: Path) -> None:
-    """Refuse packages that were built of other sources: they might not read the added settings."""
+    """Raise ConfigurationError if *packages* was built of other sources than those of this checkout.
+
+    Other sources might not know the settings that are added.
+    """
     built = {
         file.relative_to(packages).as_posix(): _digest(file) for file in (packages / _PACKAGE).rglob("*.py")
     }
@@ -78,7 +83,7 @@ def _check_fresh(packages: Path) -> None:
 
 
 def _read_digests(file: Path) -> dict[str, str]:
-    """Return the digests of our sources that the builder wrote into *file*; none without such a file."""
+    """Return the digests of our sources by path, which the build wrote into *file*; none without the file."""
     if not file.exists():
         return {}
     try:
@@ -93,7 +98,10 @@ def _digest(file: Path) -> str:
 
 
 def sums_text(folder: Path) -> str:
-    """Return one line for each file, as sha256sum writes it."""
+    """Return a line with digest and path for each file in *folder*, as ``sha256sum`` writes them.
+
+    The list itself, `SUMS_FILE`, is left out.
+    """
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != SUMS_FILE)
     return "".join(
         f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n"

@@ -1,12 +1,12 @@
 """The backend servers of Fig. 2: an Auto Scaling group of Debian machines without a route to the internet.
 
 They boot from one package in S3, whose digest is in the template.  There is no SSH and no public address;
-IMDSv2 is limited to one hop.  An instance that the load balancer finds unhealthy is replaced, and one that
-does not report that it is ready never joins.
+IMDSv2 is limited to one hop.  An instance that fails the load balancer's health checks is replaced, and an
+instance that does not become ready in time never joins the group.
 
-A deployment makes a new version of the launch template and moves no server: the group keeps the version that
-the stack's parameter `VERSION_PARAMETER` names.  Only rse-pf cloud upgrade changes it, after it has replaced
-the servers.
+A deployment creates a new version of the launch template and replaces no server: the group keeps the version
+that the stack's parameter `VERSION_PARAMETER` names.  Only ``rse-pf cloud upgrade`` changes the parameter,
+after it has replaced the servers.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ _STORE = "rse_pf/aws/storage/s3_store.py:S3Store"
 
 
 class BackendServers(Construct):
-    """Role, launch template and group; ``facts`` are passed to an instance at its boot."""
+    """The servers' IAM role, launch template and Auto Scaling group.
+
+    ``facts`` are the values, such as names of buckets, that an instance gets at its boot.
+    """
 
     def __init__(
         self,
@@ -92,13 +95,14 @@ class BackendServers(Construct):
         Capacity(self, "Capacity", group=self.group, settings=settings)
         resource = cast("autoscaling.CfnAutoScalingGroup", self.group.node.default_child)
         resource.target_group_arns = [target.target_group_arn for target in targets]
-        # A replacement is ready before an unhealthy server ends, as in an upgrade.
+        # A new server is ready before the unhealthy one is terminated, as in an upgrade.
         resource.instance_maintenance_policy = (
             autoscaling.CfnAutoScalingGroup.InstanceMaintenancePolicyProperty(
                 min_healthy_percentage=100, max_healthy_percentage=MAX_HEALTHY_PERCENT
             )
         )
-        # In the group itself: a hook of its own would come after the first instances.
+        # The hook is a property of the group: as a resource of its own it would be created after the first
+        # instances were launched.
         resource.lifecycle_hook_specification_list = [
             autoscaling.CfnAutoScalingGroup.LifecycleHookSpecificationProperty(
                 lifecycle_hook_name=names.launch_hook,
@@ -115,7 +119,7 @@ class BackendServers(Construct):
         )  # fmt: skip
 
     def _keep_version(self, resource: autoscaling.CfnAutoScalingGroup) -> None:
-        """Name the version of the launch template by a parameter, whose value a deployment keeps."""
+        """Make the group use the launch template version in a stack parameter, which deployments keep."""
         version = cdk.CfnParameter(
             cdk.Stack.of(self), VERSION_PARAMETER, default="1", allowed_pattern="[1-9][0-9]*",
             description="launch template of the servers; rse-pf cloud upgrade changes it",
@@ -132,7 +136,7 @@ class BackendServers(Construct):
             used_by="stacks/boot/first_boot.py:asked",
             why="servers of the version before boot from the package before; a digest says what may run",
         )  # fmt: skip
-        # Without it S3 answers "forbidden" instead of "not found" for a key set that does not exist yet.
+        # Without ListBucket S3 answers "forbidden", not "not found", for a key set that does not exist yet.
         allow(role, ["s3:ListBucket"], [artifacts.bucket_arn], used_by=f"{_STORE}._get")
         allow(
             role, ["cloudwatch:PutMetricData"], ["*"],
@@ -162,7 +166,7 @@ class BackendServers(Construct):
         allow(self.role, ["s3:ListBucket"], [maps.bucket_arn], used_by=f"{_STORE}._pages")
 
     def _allow_audit(self, audit_logs: s3.IBucket) -> None:
-        """Allow the servers to write pieces of the audit log under new names; not to read, list or delete."""
+        """Allow the servers to write audit logs under new names, but not to read, list or delete them."""
         allow(
             self.role, ["s3:PutObject"], [audit_logs.arn_for_objects(f"{AUDIT_PREFIX}/*")],
             conditions={"Null": {"s3:if-none-match": "false"}}, used_by=f"{_STORE}._write",
@@ -178,14 +182,14 @@ def launch_template(
     settings: PlatformSettings,
     facts: Mapping[str, str],
 ) -> ec2.LaunchTemplate:
-    """Return the launch template of a server; *facts* are passed to `stacks/boot/first_boot.py`.
+    """Return the launch template of a server, whose user data run `stacks/boot/first_boot.py`.
 
     Args:
-        scope: Has one template.
-        role: Of the instance.
+        scope: Construct that contains the template.
+        role: IAM role of the instance.
         firewall_group: The only security group of the instance.
-        settings: Image and instance type.
-        facts: Plain words by name.
+        settings: Settings of the platform, with image and instance type.
+        facts: Values that `first_boot.main` gets, by name; plain words without quotes.
     """
     encrypted = ec2.BlockDeviceVolume.ebs(
         VOLUME_GB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True

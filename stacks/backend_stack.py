@@ -1,4 +1,4 @@
-"""The platform itself: load balancer, backend servers, monitor, scale modifier and the topic of alarms."""
+"""The backend stack: load balancer, backend servers, monitor, scale modifier and the topic of alarms."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from stacks.values import import_bucket, import_group, import_network, provide
 __all__ = ["TRUSTED", "BackendStack"]
 
 TRUSTED = (KEYS_NAME, ROBOTS_NAME, DENY_NAME)
-"""Objects that decide which robots are admitted: public keys, enrolled robots, revoked tokens."""
+"""Names of the objects that decide which robots may connect: public keys, roster and deny list."""
 
 
 class BackendStack(cdk.Stack):
-    """Everything that a release changes.
+    """The stack with everything that a new release changes.
 
-    It reads the network and the buckets, and provides ``backend/topic``, ``backend/balancer``,
-    ``backend/listener`` and ``backend/robots``: ARNs of the topic, the load balancer, its listener and the
-    robots' target group.
+    It reads network and buckets from other stacks, and provides for them the ARNs ``backend/topic``,
+    ``backend/balancer``, ``backend/listener`` and ``backend/robots`` (the robots' target group), and the
+    robots' address ``backend/url``.
     """
 
     def __init__(
@@ -58,7 +58,8 @@ class BackendStack(cdk.Stack):
         vpc = import_network(self, names, zones=ZONES, server_zones=zone_count(settings), cidr=CIDR)
         artifacts = import_bucket(self, names, "artifacts")
         self.topic = sns.Topic(self, "Events", enforce_ssl=True)
-        # A policy of its own replaces the topic's default policy, which admits the account's alarms.
+        # A policy for TLS (enforce_ssl) replaces the default policy of the topic, which lets the account's
+        # alarms publish; therefore they are allowed here.
         self.topic.add_to_resource_policy(
             iam.PolicyStatement(
                 principals=[
@@ -93,7 +94,7 @@ class BackendStack(cdk.Stack):
             why="archives of published services are named by their digests; operators alone write them",
         )  # fmt: skip
         group = self.servers.group
-        # By name, not by reference: a reference would make a cycle with the group.
+        # The group is named, not referenced: a reference would be a cycle, because the group needs the role.
         allow(
             self.servers.role, ["autoscaling:CompleteLifecycleAction"],
             [

@@ -1,7 +1,8 @@
-"""The canary: a function that asks for one known pose through the load balancer each minute.
+"""The canary: a Lambda function that requests one known pose through the load balancer each minute.
 
-It connects as any robot does: to the public address, with a private key of its own that the operator enrols
-by `rse-pf cloud canary`.  It runs outside the VPC, and may read one secret and nothing else.
+It connects as a robot does, to the public address, with a token that it signs by its own private key; the
+operator enrols it by `rse-pf cloud canary`.  It runs outside the VPC, and may read its secret and nothing
+else.
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
 
 __all__ = ["Canary"]
 
-# Time limit of an execution, in seconds: the handler gives up earlier, and logs its own error.
+# Time limit of an execution of the canary, in seconds: the handler gives up after 10 s and logs its error.
 _TIMEOUT_S = 30
 
 
 class Canary(Construct):
-    """Function, its log, its key and its schedule."""
+    """The canary's function, its log group, the secret with its key, and the rule that calls it each minute.
+
+    *url* is the address of the load balancer for robots.
+    """
 
     def __init__(
         self, scope: Construct, construct_id: str, *, settings: PlatformSettings, assets: Path, url: str
@@ -67,7 +71,7 @@ class Canary(Construct):
                 },
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
-        # The alarm reports a failure; a retry would hide it.
+        # Without retries: each failed call counts in the metric that the alarm reads.
         function.configure_async_invoke(retry_attempts=0, max_event_age=cdk.Duration.seconds(CANARY_PERIOD_S))
         events.Rule(
             self, "EachMinute", schedule=events.Schedule.rate(cdk.Duration.seconds(CANARY_PERIOD_S)),

@@ -1,6 +1,6 @@
-"""The sources of the servers' capacity: a warm pool, Spot, several instance types, zones and a schedule.
+"""The capacity of the backend servers: a warm pool, Spot, several instance types, zones and a schedule.
 
-Everything here changes the Auto Scaling group that `stacks.backend_servers` made, and nothing else.
+Everything here configures the Auto Scaling group of `stacks.backend_servers`, and nothing else.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from stacks.findings import acknowledge
 
 __all__ = ["Capacity"]
 
-# Percentage of on-demand servers where Spot instances are not used.
+# Percentage of on-demand instances if Spot instances are not used.
 _ALL_ON_DEMAND = 100
 
 
 class Capacity(Construct):
-    """Warm pool, purchase options, zones and scheduled minimum of one group."""
+    """The warm pool, purchase options, zones and scheduled minimum size of one Auto Scaling group."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Capacity(Construct):
     ) -> None:
         super().__init__(scope, construct_id)
         raw = cast("autoscaling.CfnAutoScalingGroup", group.node.default_child)
-        # Zones hold equal numbers while all have capacity; a zone without capacity is left out.
+        # Each zone gets the same number of servers; if a zone has no capacity, the others get its servers.
         raw.availability_zone_distribution = (
             autoscaling.CfnAutoScalingGroup.AvailabilityZoneDistributionProperty(
                 capacity_distribution_strategy="balanced-best-effort"
@@ -44,10 +44,10 @@ class Capacity(Construct):
         )
         types = instance_types(settings.cloud.instance_type, settings.cloud.other_instance_types)
         if settings.cloud.spot or len(types) > 1:
-            self._mix(raw, types, settings)
+            self._allow_mixed_instances(raw, types, settings)
         if settings.cloud.warm_servers:
             # "Only when MaxGroupPreparedCapacity and MinSize are set to the same value does the warm pool
-            # have an absolute size" (AWS, PutWarmPool); else it grows to what is missing to the maximum.
+            # have an absolute size" (AWS, PutWarmPool); else the pool fills the group up to its maximum.
             autoscaling.CfnWarmPool(
                 self, "WarmPool", auto_scaling_group_name=group.auto_scaling_group_name, pool_state="Stopped",
                 min_size=settings.cloud.warm_servers,
@@ -59,13 +59,16 @@ class Capacity(Construct):
         for number, entry in enumerate(parse_schedule(settings.scaling.schedule)):
             autoscaling.CfnScheduledAction(
                 self, f"Schedule{number}", auto_scaling_group_name=group.auto_scaling_group_name,
-                min_size=entry.min_servers, recurrence=_cron(entry), time_zone=_zone(settings),
+                min_size=entry.min_servers, recurrence=_cron(entry), time_zone=_time_zone(settings),
             )  # fmt: skip
 
-    def _mix(
+    def _allow_mixed_instances(
         self, raw: autoscaling.CfnAutoScalingGroup, types: Sequence[str], settings: PlatformSettings
     ) -> None:
-        """Let the group take several instance types, and Spot instances above the servers on demand."""
+        """Let the group use several instance *types* and, with ``cloud.spot``, Spot instances.
+
+        `ON_DEMAND_SERVERS` servers are on demand nevertheless.
+        """
         cloud, kind = settings.cloud, autoscaling.CfnAutoScalingGroup
         raw.mixed_instances_policy = kind.MixedInstancesPolicyProperty(
             launch_template=kind.LaunchTemplateProperty(
@@ -90,6 +93,6 @@ def _cron(entry: ScheduleEntry) -> str:
     return f"{entry.minute} {entry.hour} * * {','.join(map(str, entry.days))}"
 
 
-def _zone(settings: PlatformSettings) -> str:
-    # Auto Scaling takes Universal Time under this name only.
+def _time_zone(settings: PlatformSettings) -> str:
+    # Auto Scaling knows UTC only by the name Etc/UTC.
     return "Etc/UTC" if settings.scaling.time_zone == "UTC" else settings.scaling.time_zone

@@ -1,7 +1,8 @@
-"""Buckets and the signing key: they stay when the stack is deleted, and are hard to delete.
+"""The data stack: buckets and the signing key, which are retained when the stack is deleted.
 
-To delete the data, an operator turns termination protection off and then empties the buckets by hand.
-Audit logs also need a role that may bypass their retention.
+To delete the data, an operator calls ``rse-pf cloud down --delete-data``, or turns termination protection off
+and empties the buckets by hand.  Audit logs that are still locked can only be deleted by a role that may
+bypass their retention.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ BALANCER_LOGS = "alb"
 """Prefix of the load balancer's access logs in their bucket."""
 
 _DAY = cdk.Duration.days(1)
-_LEASES = ("live/", "jobs/", "accounts/")
-"""Prefixes of leases and accounts, which change up to twice a second: each change leaves a former version."""
-# Days after which an object moves to infrequent access: the least that S3 allows.
+_FREQUENTLY_WRITTEN = ("live/", "jobs/", "accounts/")
+"""Prefixes of leases and accounts, which change up to twice a second: old versions are kept for a day."""
+# Days after which a map or object moves to the class Infrequent Access: the least that S3 allows.
 _INFREQUENT_AFTER_DAYS = 30
-# Days after which an object moves to Glacier (paper, Sect. 5.1); its class needs no restore before a read.
+# Days after which it moves to Glacier Instant Retrieval, which needs no restore before a read (Sect. 5.1).
 _GLACIER_AFTER_DAYS = 90
 
 
 class DataStack(cdk.Stack):
-    """Map, artifact, audit-log and access-log buckets; the secret of the signing key.
+    """The stack with the buckets of maps, artifacts, audit logs and access logs, and the signing key.
 
-    It provides the buckets' names as ``data/maps``, ``data/artifacts``, ``data/audit-logs`` and
-    ``data/access-logs``.
+    It provides the buckets' names for other stacks as ``data/maps``, ``data/artifacts``, ``data/audit-logs``
+    and ``data/access-logs``.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class DataStack(cdk.Stack):
                 )
             ],
         )
-        for prefix in _LEASES:
+        for prefix in _FREQUENTLY_WRITTEN:
             self.maps.add_lifecycle_rule(prefix=prefix, noncurrent_version_expiration=_DAY)
         self.artifacts = self._bucket("Artifacts", self.access_logs)
         for bucket in (self.maps, self.artifacts):
@@ -101,7 +102,10 @@ class DataStack(cdk.Stack):
             provide(self, names, f"data/{name}", bucket.bucket_name)
 
     def _admit_balancer(self) -> None:
-        """Allow load balancers of this account to write access logs; other stacks cannot grant this."""
+        """Allow load balancers of this account to write access logs.
+
+        The statement belongs to the bucket's policy, which only this stack can change.
+        """
         writer = region_info.RegionInfo.get(self.region).elbv2_account
         service = iam.ServicePrincipal("logdelivery.elasticloadbalancing.amazonaws.com")
         self.access_logs.add_to_resource_policy(

@@ -1,4 +1,4 @@
-"""Acknowledge a finding of cdk-nag, never without a reason."""
+"""Acknowledge findings of cdk-nag, each with a reason."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["acknowledge"]
 
 
 def acknowledge(construct: IConstruct, reason: str, *rules: str) -> None:
-    """Accept the findings *rules* of AwsSolutions at *construct*, because of *reason*."""
+    """Accept the findings of the AwsSolutions *rules*, such as ``EC23``, at *construct*, with *reason*."""
     cdk.Validations.of(construct).acknowledge(
         *(cdk.Acknowledgment(id=f"AwsSolutions::AwsSolutions-{rule}", reason=reason) for rule in rules)
     )

@@ -1,7 +1,7 @@
-"""The firewall of Fig. 2: world -> load balancer -> backend servers, and nothing else in any direction.
+"""The firewall of Fig. 2: robots reach the load balancer, the load balancer reaches the backend servers.
 
-Servers reach only S3, the interface endpoints, and owners of live maps on each other.  Only the listener is
-open to a range of addresses, ``cloud.robot_cidr``.
+Servers reach only S3, the interface endpoints, and map servers on other backend servers.  Only the load
+balancer's port is open to addresses outside of the VPC, those of ``cloud.robot_cidr``.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from stacks.findings import acknowledge
 
 __all__ = ["S3_PREFIX_LISTS", "Firewall", "front_port", "inner_ports", "live_range", "s3_prefix_list"]
 
-# Ports of the listener without and with TLS.
+# Port of the load balancer without TLS.
 _HTTP = 80
+# Port of the load balancer with TLS, and of AWS's services.
 _HTTPS = 443
 
 S3_PREFIX_LISTS = {
@@ -27,29 +28,35 @@ S3_PREFIX_LISTS = {
     "ap-northeast-1": "pl-61a54008", "ap-northeast-2": "pl-78a54011", "ap-southeast-1": "pl-6fa54006",
     "ap-southeast-2": "pl-6ca54005",
 }  # fmt: skip
-"""Managed prefix lists com.amazonaws.REGION.s3 of AWS, each from at least two published route tables."""
-_LOOK_UP = "aws ec2 describe-managed-prefix-lists --filters Name=prefix-list-name,Values=com.amazonaws.{}.s3"
+"""Ids of AWS's managed prefix lists com.amazonaws.REGION.s3, each seen in two published route tables."""
+_LOOK_UP_COMMAND = (
+    "aws ec2 describe-managed-prefix-lists --filters Name=prefix-list-name,Values=com.amazonaws.{}.s3"
+)
 
 
 def s3_prefix_list(settings: PlatformSettings) -> str:
-    """Return the prefix list of S3 in ``cloud.region``; raises ConfigurationError for an unknown region."""
+    """Return the id of the prefix list of S3 in ``cloud.region``, or the one in ``cloud.s3_prefix_list``.
+
+    Raises:
+        ConfigurationError: The setting is empty, and no id is known for the region.
+    """
     region = settings.cloud.region
     prefix_list = settings.cloud.s3_prefix_list or S3_PREFIX_LISTS.get(region)
     if not prefix_list:
         raise ConfigurationError(
             f"no S3 prefix list is known for cloud.region = {region!r}",
-            hint=f"set cloud.s3_prefix_list to the id that this prints: {_LOOK_UP.format(region)}",
+            hint=f"set cloud.s3_prefix_list to the id that this prints: {_LOOK_UP_COMMAND.format(region)}",
         )
     return prefix_list
 
 
 def front_port(settings: PlatformSettings) -> int:
-    """Return the port of the listener: 80 with ``cloud.allow_insecure``, else 443 for TLS."""
+    """Return the port of the load balancer's listener: 80 with ``cloud.allow_insecure``, else 443 for TLS."""
     return _HTTP if settings.cloud.allow_insecure else _HTTPS
 
 
 class Firewall(Construct):
-    """Security groups of the load balancer, the servers and the endpoints."""
+    """The security groups of the load balancer, the servers and the interface endpoints."""
 
     def __init__(
         self, scope: Construct, construct_id: str, *, vpc: ec2.IVpc, settings: PlatformSettings
@@ -86,17 +93,17 @@ class Firewall(Construct):
 
 
 def inner_ports(settings: PlatformSettings) -> list[int]:
-    """Return the ports of a server that the load balancer uses."""
+    """Return the ports of a server that the load balancer connects to, of the enabled services."""
     data = [settings.data.port] if settings.data.enabled else []
     rosbridge = [ROSBRIDGE_PORT] if settings.serving.rosbridge else []
     return [settings.serving.port, settings.serving.control_port, *data, *rosbridge]
 
 
 def live_range(settings: PlatformSettings) -> range | None:
-    """Return the ports on which servers reach owners of live maps on each other; None without live maps.
+    """Return the ports of the map servers, on which backend servers reach each other; None without live maps.
 
     Raises:
-        ConfigurationError: The ports are not known beforehand.
+        ConfigurationError: ``live.first_port`` is 0, so that the ports are not known beforehand.
     """
     if not settings.data.enabled or not settings.live.max_owners:
         return None

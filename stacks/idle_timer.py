@@ -1,6 +1,6 @@
 """The function that parks the deployment if nobody used it for `IDLE_HOURS`, and resumes it by schedule.
 
-It is called each hour where ``cloud.idle_action`` says so, and at the entries of ``scaling.schedule`` that do
+It is called each hour if ``cloud.idle_action`` says so, and at those entries of ``scaling.schedule`` that do
 not lower the number of servers.
 """
 
@@ -31,19 +31,23 @@ from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
 
 __all__ = ["IdleTimer"]
 
-# Time limit of an execution, in seconds: it makes about a dozen calls of AWS.
+# Time limit of an execution of the function, in seconds: it makes about a dozen calls to AWS.
 _TIMEOUT_S = 60
-# Memory of the function, which only makes calls of AWS.
+# Memory of the function in MB; it only makes calls to AWS.
 _MEMORY_MB = 256
 _LIFECYCLE = "rse_pf/aws/lifecycle"
-# Repetitions of a call that resumes the deployment, after a failure.
+# Number of times that a failed call which resumes the deployment is repeated.
 _RETRIES = 5
-# Time limit of these repetitions, in seconds: an hour late is better than a working day without servers.
+# Seconds within which a failed call which resumes the deployment is repeated: an hour late is better than a
+# working day without servers.
 _RETRY_WITHIN_S = 3600
 
 
 class IdleTimer(Construct):
-    """Function, its log and what calls it."""
+    """The function, its log group, its role, and the rule and schedules that call it.
+
+    *topic* is the ARN of the SNS topic that is notified when the deployment is parked or resumed.
+    """
 
     def __init__(
         self, scope: Construct, construct_id: str, *, settings: PlatformSettings, assets: Path, topic: str
@@ -73,12 +77,12 @@ class IdleTimer(Construct):
             )  # fmt: skip
         entries = resuming(parse_schedule(settings.scaling.schedule))
         if entries:
-            self._resume(function, entries, settings)
+            self._call_at_entries(function, entries, settings)
 
-    def _resume(
+    def _call_at_entries(
         self, function: lambda_.Function, entries: Sequence[ScheduleEntry], settings: PlatformSettings
     ) -> None:
-        """Call the function at each of *entries*: a parked group takes no scheduled actions."""
+        """Call *function* at each of *entries*, because a parked group carries out no scheduled actions."""
         account = cdk.Stack.of(self).account
         caller = iam.Role(
             self, "Caller", assumed_by=iam.ServicePrincipal(
@@ -105,7 +109,7 @@ class IdleTimer(Construct):
             ).node.add_dependency(caller)  # fmt: skip
 
     def _allow(self, role: iam.Role, names: ResourceNames, topic: str) -> None:
-        """Allow to read, to end and to start servers; nothing but the note can be deleted."""
+        """Allow *role* to read metrics, change sizes of groups, switch alarms, and write the note."""
         stack = cdk.Stack.of(self)
         why = "these actions take no resources"
         allow(

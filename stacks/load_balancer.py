@@ -18,12 +18,15 @@ from stacks.web_firewall import WebFirewall
 
 __all__ = ["LoadBalancer"]
 
-# Time that a server gets to end its connections before it is removed, in seconds: robots move within 5 s.
+# Seconds for which the connections to a removed server may continue: robots move to another one within 5 s.
 _DEREGISTRATION_S = 30
 
 
 class LoadBalancer(Construct):
-    """Listener, target groups of the services that run, and the web firewall in front of it."""
+    """The load balancer, its listener, the target groups of the enabled services, and the web firewall.
+
+    *group* is the load balancer's security group, *logs* the bucket of its access logs.
+    """
 
     def __init__(
         self,
@@ -41,7 +44,7 @@ class LoadBalancer(Construct):
             idle_timeout=cdk.Duration.seconds(BALANCER_IDLE_TIMEOUT_S),
             desync_mitigation_mode=elbv2.DesyncMitigationMode.STRICTEST,
         )  # fmt: skip
-        # Their fields name no request header but Host and User-Agent (docs/security.md): no token is in them.
+        # The access logs hold no request headers but Host and User-Agent (docs/security.md), so no tokens.
         self.alb.log_access_logs(logs, BALANCER_LOGS)
         self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}
         insecure = settings.cloud.allow_insecure
@@ -61,7 +64,8 @@ class LoadBalancer(Construct):
                 ],
                 target_groups=[self.targets["data"]],
             )  # fmt: skip
-            # Each request would cost a request to the bucket; health checks do not pass through the listener.
+            # The readiness check is not reachable through the listener, because each call costs a request to
+            # the bucket; the load balancer's own health checks do not pass through the listener.
             listener.add_action(
                 "NotReady", priority=5,
                 conditions=[elbv2.ListenerCondition.path_patterns([f"/data{READY_PATH}"])],

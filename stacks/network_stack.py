@@ -1,4 +1,4 @@
-"""The network: a VPC in two zones, routed to the internet only for the load balancer, and the firewall."""
+"""The network stack: a VPC in two zones, in which only the load balancer has a route to the internet."""
 
 from __future__ import annotations
 
@@ -21,25 +21,30 @@ from stacks.values import provide, provide_network
 
 __all__ = ["CIDR", "ZONES", "NetworkStack"]
 
-# Addresses of the VPC.
+# Range of the addresses of the VPC.
 CIDR = "10.20.0.0/16"
-# Availability zones that the network spans: a load balancer needs two.
+# Number of availability zones of the network: a load balancer needs two.
 ZONES = 2
-# Ephemeral ports, to which answers go; access lists keep no connection state.
+# First ephemeral port: clients receive answers on ports from here on.
 _FIRST_ANSWER_PORT = 1024
+# Last TCP port.
 _LAST_PORT = 65535
 _HTTPS = 443
-# ICMP type and code by which a router reports the largest packet that it forwards (RFC 1191).
-_UNREACHABLE = 3
-_TOO_BIG = 4
-_WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1), in addition to security groups"
+# ICMP type "destination unreachable"; with the code below a router reports its largest packet (RFC 1191).
+_ICMP_UNREACHABLE = 3
+# ICMP code "fragmentation needed".
+_ICMP_FRAGMENTATION_NEEDED = 4
+_REASON_FOR_LISTS = (
+    "the paper's firewall has access control lists (Sect. 3.1), in addition to security groups"
+)
 
 
 class NetworkStack(cdk.Stack):
-    """VPC, endpoints, access control lists, flow logs and the firewall.
+    """The stack with the VPC, its endpoints, access control lists, flow logs and the firewall.
 
-    It provides ``network/vpc``, ``network/front-N`` and ``network/servers-N`` for the subnets of zone N, and
-    ``network/group-balancer``, ``-servers`` and ``-endpoints``.
+    It provides for other stacks the ids ``network/vpc``, ``network/front-N`` and ``network/servers-N`` (the
+    subnets in zone N), and the security groups ``network/group-balancer``, ``network/group-servers`` and
+    ``network/group-endpoints``.
     """
 
     def __init__(
@@ -93,11 +98,14 @@ class NetworkStack(cdk.Stack):
     @property
     @jsii.member(jsii_name="availabilityZones")
     def availability_zones(self) -> list[str]:
-        """The zones, so that synthesis makes no request to AWS."""
+        """The zones as CloudFormation expressions, so that the synthesis makes no request to AWS."""
         return [cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(ZONES)]
 
     def _control_lists(self, settings: PlatformSettings) -> None:
-        """Repeat what the security groups allow, with the responses: access control lists are stateless."""
+        """Add access control lists that allow the traffic of the security groups, and its answers.
+
+        Access control lists keep no connection state, so answers are allowed by rules of their own.
+        """
         answers = ec2.AclTraffic.tcp_port_range(_FIRST_ANSWER_PORT, _LAST_PORT)
         anywhere, inside = ec2.AclCidr.any_ipv4(), ec2.AclCidr.ipv4(self.vpc.vpc_cidr_block)
         front = self._control_list("FrontList", ec2.SubnetType.PUBLIC)
@@ -119,8 +127,8 @@ class NetworkStack(cdk.Stack):
         self._entry(back, "Answers", 120, anywhere, answers, inward=True)
         self._entry(back, "Https", 100, anywhere, https, inward=False)
         self._entry(back, "ToInside", 110, inside, answers, inward=False)
-        # "Fragmentation needed": without it, large messages over a VPN or a cellular network are lost.
-        too_big = ec2.AclTraffic.icmp(type=_UNREACHABLE, code=_TOO_BIG)
+        # Without "fragmentation needed", large messages over a VPN or a cellular network would be lost.
+        too_big = ec2.AclTraffic.icmp(type=_ICMP_UNREACHABLE, code=_ICMP_FRAGMENTATION_NEEDED)
         for of, peer in ((front, robots), (back, anywhere)):
             self._entry(of, "MtuIn", 140, peer, too_big, inward=True)
             self._entry(of, "MtuOut", 140, peer, too_big, inward=False)
@@ -128,7 +136,7 @@ class NetworkStack(cdk.Stack):
     def _control_list(self, name: str, kind: ec2.SubnetType) -> ec2.NetworkAcl:
         where = ec2.SubnetSelection(subnet_type=kind)
         control_list = ec2.NetworkAcl(self, name, vpc=self.vpc, subnet_selection=where)
-        acknowledge(control_list, _WHY_LISTS, "VPC3")
+        acknowledge(control_list, _REASON_FOR_LISTS, "VPC3")
         return control_list
 
     def _entry(
@@ -136,7 +144,7 @@ class NetworkStack(cdk.Stack):
     ) -> None:
         direction = ec2.TrafficDirection.INGRESS if inward else ec2.TrafficDirection.EGRESS
         entry = of.add_entry(name, cidr=cidr, rule_number=number, traffic=traffic, direction=direction)
-        acknowledge(entry, _WHY_LISTS, "VPC3")
+        acknowledge(entry, _REASON_FOR_LISTS, "VPC3")
 
     def _flow_logs(self, settings: PlatformSettings) -> None:
         group = logs.LogGroup(self, "FlowLog", removal_policy=cdk.RemovalPolicy.DESTROY)

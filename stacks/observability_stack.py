@@ -1,6 +1,6 @@
-"""Monitoring for the operator: a dashboard of the boxes of Fig. 2, alarms with runbooks, and a budget.
+"""The observability stack: a dashboard of the boxes of Fig. 2, alarms with runbooks, canary and budget.
 
-The alarms here notify an operator and do not scale the group; `rse_pf.scaling.operator_alarms` defines them.
+The alarms here notify an operator and do not scale the fleet; `rse_pf.scaling.operator_alarms` defines them.
 """
 
 from __future__ import annotations
@@ -30,23 +30,27 @@ from stacks.values import read
 
 __all__ = ["ObservabilityStack"]
 
-# Width of a graph: half of the dashboard's 24 columns.
-_WIDTH = 12
-# Namespaces of AWS.
+# Width of a graph in columns: half of the dashboard's 24 columns.
+_GRAPH_WIDTH = 12
+# CloudWatch namespaces of AWS's services.
 _ALB = "AWS/ApplicationELB"
 _EC2 = "AWS/EC2"
 _GROUP = "AWS/AutoScaling"
 _LAMBDA = "AWS/Lambda"
 _S3 = "AWS/S3"
-# Shares of the budget whose use, or forecast use, notifies the topic: early enough to act in the same month.
+# Percentage of the monthly budget that, once spent, notifies the operator: early enough to act in that month.
 _BUDGET_ACTUAL_PERCENT = 80
+# Percentage of the monthly budget whose forecast use notifies the operator.
 _BUDGET_FORECAST_PERCENT = 100
 
 Dimensions = Mapping[str, str]
 
 
 class ObservabilityStack(cdk.Stack):
-    """Dashboard, operator alarms, canary and budget; it reads what the backend and data stacks provide."""
+    """The stack with the dashboard, the operator's alarms, canary, idle timer and budget.
+
+    It reads the values that the backend and data stacks provide.
+    """
 
     def __init__(
         self,
@@ -86,7 +90,7 @@ class ObservabilityStack(cdk.Stack):
             self._budget(names, settings.cloud.budget_per_month, topic)
 
     def _dashboard(self, names: ResourceNames, settings: PlatformSettings) -> None:
-        """Show each box of Fig. 2 in a row of its own, with its load and its faults."""
+        """Add the dashboard, with a row for each box of Fig. 2 that shows its load and its faults."""
         of = self._metric
         rows: dict[str, dict[str, list[cloudwatch.IMetric]]] = {
             "Firewall": {
@@ -150,10 +154,10 @@ class ObservabilityStack(cdk.Stack):
             ]  # fmt: skip
         board = cloudwatch.Dashboard(self, "Dashboard", dashboard_name=names.dashboard)
         for box, graphs in rows.items():
-            board.add_widgets(cloudwatch.TextWidget(markdown=f"# {box}", width=2 * _WIDTH, height=1))
+            board.add_widgets(cloudwatch.TextWidget(markdown=f"# {box}", width=2 * _GRAPH_WIDTH, height=1))
             board.add_widgets(
                 *(
-                    cloudwatch.GraphWidget(title=title, left=series, width=_WIDTH)
+                    cloudwatch.GraphWidget(title=title, left=series, width=_GRAPH_WIDTH)
                     for title, series in graphs.items()
                 )
             )
@@ -198,9 +202,10 @@ class ObservabilityStack(cdk.Stack):
         )  # fmt: skip
 
     def _budget(self, names: ResourceNames, usd: float, topic: str) -> None:
-        """Notify the topic when the account's costs of a month exceed, or will exceed, the budget.
+        """Add a monthly budget of *usd* US dollars, whose notifications go to the topic.
 
-        It covers the whole account: AWS separates costs by a tag only after the tag was activated by hand.
+        The budget covers the costs of the whole account: AWS separates costs by a tag only after the tag was
+        activated by hand.
         """
         budgets.CfnBudget(
             self, "Budget",
@@ -226,5 +231,5 @@ class ObservabilityStack(cdk.Stack):
 
 
 def _after(arn: str, word: str) -> str:
-    """Return what follows *word* in an ARN that is known at the deployment."""
+    """Return the text that follows *word* in *arn*, as an expression for CloudFormation."""
     return cdk.Fn.select(1, cdk.Fn.split(word, arn))

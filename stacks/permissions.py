@@ -1,7 +1,7 @@
-"""Grant one action at a time, and record which line of code needs it.
+"""Grant IAM permissions, and record which function of the code makes each call.
 
-`tests/stacks/test_permissions.py` compares the records with the templates: an action without a user, and a
-user that does not make the call, are both errors.  Nothing is granted elsewhere.
+`tests/stacks/test_permissions.py` compares the records with the templates: an action that no function needs,
+and a function that does not make the call, are both errors.  No other module grants permissions.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from stacks.findings import acknowledge
 __all__ = ["BY_AWS", "LOG_ACTIONS", "USED_BY", "allow", "explain"]
 
 USED_BY = "rse-pf:used-by"
-"""The type of the construct metadata that holds the records; it is written to the assembly's manifest."""
+"""Type of the construct metadata that holds the records; the CDK writes it into the assembly's manifest."""
 BY_AWS = "aws: "
-"""Prefix of ``used_by`` where a service of AWS makes the call itself; the reason follows."""
+"""Prefix of ``used_by`` if a service of AWS makes the call itself; the reason follows."""
 LOG_ACTIONS = ("logs:CreateLogStream", "logs:PutLogEvents")
 """Actions that the CDK grants to the writers of a log group."""
 
@@ -35,17 +35,18 @@ def allow(
     conditions: Mapping[str, Any] | None = None,
     why: str = "",
 ) -> None:
-    """Allow *role* the *actions* on *resources*, and record who calls them.
+    """Allow *role* the *actions* on *resources*, and record which functions make the calls.
 
     Args:
         role: A role of the same stack.
         actions: Names such as ``s3:GetObject``; no wildcards.
         resources: ARNs, or ``*`` for actions that take no resources.
-        used_by: ``path/of/file.py:function`` or ``path/of/file.py:Class.method``, or the file alone if it has
-            one purpose; one or more.  Each action is called by at least one of them.  `BY_AWS` and a reason
-            where a service makes the call.
-        conditions: Of the statement.
-        why: Accepts the finding of cdk-nag about each resource that holds ``*``; needed only then.
+        used_by: One or more of ``path/of/file.py:function``, ``path/of/file.py:Class.method``, or the path
+            alone if the file has one purpose; at least one of them calls each action.  If a service of AWS
+            makes the call: `BY_AWS` and the reason.
+        conditions: Conditions of the IAM statement.
+        why: Reason for which cdk-nag's finding about resources that hold ``*`` is accepted; needed only for
+            such resources.
     """
     role.add_to_principal_policy(
         iam.PolicyStatement(
@@ -60,13 +61,16 @@ def allow(
 
 
 def explain(role: IConstruct, actions: Sequence[str], *, used_by: str | Sequence[str]) -> None:
-    """Record who needs *actions* that the CDK granted to *role*, or to a role inside that construct."""
+    """Record which functions need *actions* that the CDK granted to *role*, or to a role inside *role*.
+
+    *used_by* has the form that `allow` describes.
+    """
     users = [used_by] if isinstance(used_by, str) else list(used_by)
     role.node.add_metadata(USED_BY, {"actions": list(actions), "used_by": users})
 
 
 def _flat(resolved: Any) -> str:
-    """Return a resolved ARN as cdk-nag writes it in the name of a finding."""
+    """Return a resolved ARN, a text or a CloudFormation expression, as cdk-nag writes it in findings."""
     if isinstance(resolved, str):
         return resolved.replace("${", "<").replace("}", ">")
     if "Fn::Join" in resolved:

@@ -1,8 +1,8 @@
-"""Copy keys, roster, deny list, services and maps to the buckets of deployments in other regions.
+"""Replicate keys, roster, deny list, services and maps to the buckets of deployments in other regions.
 
 One deployment is the primary one: operators enrol robots, rotate keys and publish services there.  S3 copies
-public keys, roster, deny list, published services and versions of maps to the others, one way.  Live maps,
-jobs and robots' objects are not copied: a lease is valid in one region only.
+public keys, roster, deny list, published services and versions of maps from it to the others, in this
+direction only.  Live maps, jobs and robots' objects are not copied: a lease is valid in one region only.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from stacks.permissions import BY_AWS, allow
 __all__ = ["ARTIFACT_PREFIXES", "MAP_PREFIXES", "Replication"]
 
 ARTIFACT_PREFIXES = (KEYS_NAME, "control/", f"{SERVICES_PREFIX}/")
-"""Prefixes that are copied from the artifact bucket; `rse_pf.auth.trust_store` writes below ``control/``."""
+"""Prefixes of the objects that are copied from the artifact bucket.
+
+`rse_pf.auth.trust_store` writes roster and deny list below ``control/``."""
 MAP_PREFIXES = ("maps/",)
-"""Prefixes that are copied from the map bucket: versions and heads, not ``live/``."""
+"""Prefixes of the objects that are copied from the map bucket: versions and heads of maps, not live maps."""
 _BY_S3 = f"{BY_AWS}S3 copies the objects of a replication rule in this role"
 
 
 class Replication(Construct):
-    """The rules of the artifact and the map bucket, and the role that S3 copies in."""
+    """The replication rules of the artifact and the map bucket, and the IAM role with which S3 copies."""
 
     def __init__(
         self,
@@ -46,7 +48,7 @@ class Replication(Construct):
         self._copy(maps, settings.cloud.replica_maps.split(), MAP_PREFIXES)
 
     def _copy(self, bucket: s3.Bucket, replicas: Sequence[str], prefixes: Sequence[str]) -> None:
-        """Copy new objects below *prefixes*, and their deletions, to the buckets *replicas*."""
+        """Add rules that copy new objects below *prefixes*, and deletions, to the buckets *replicas*."""
         if not replicas:
             return
         targets = [f"arn:{cdk.Aws.PARTITION}:s3:::{replica}" for replica in replicas]

@@ -1,4 +1,4 @@
-"""Monitor and scale modifier of Fig. 2: the alarms of `rse_pf.scaling.alarms` with their step policies."""
+"""Monitor and scale modifier of Fig. 2: CloudWatch alarms of `rse_pf.scaling.alarms` with step policies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["ScaleModifier"]
 
 
 class ScaleModifier(Construct):
-    """One CloudWatch alarm and one step scaling policy for each rule of scaling."""
+    """A CloudWatch alarm and a step scaling policy of the group for each rule of `rse_pf.scaling.rules`."""
 
     def __init__(
         self,

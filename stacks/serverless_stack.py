@@ -1,7 +1,7 @@
-"""Pose estimation without a server: `lambda_pnp` behind the load balancer, for commands beyond the servers.
+"""The serverless stack: the Lambda function of `lambda_pnp` behind the load balancer.
 
-Robots reach it at their own address, so that one name, one certificate and one web firewall are in front of
-servers and function; only the load balancer may invoke it.
+It takes PnP commands that exceed the capacity of the servers.  Robots reach it at the address of the servers,
+so that one name, one certificate and one web firewall serve both; only the load balancer may invoke it.
 """
 
 from __future__ import annotations
@@ -30,12 +30,15 @@ from stacks.values import import_bucket, read
 
 __all__ = ["ServerlessStack"]
 
-# Priority of the rule of the listener: rules of the data service and of rosbridge have smaller numbers.
-_PRIORITY = 20
+# Number of the function's rule in the listener: after those of the data service and of rosbridge.
+_RULE_PRIORITY = 20
 
 
 class ServerlessStack(cdk.Stack):
-    """The function, its log, and its place behind the load balancer; it reads the artifact bucket."""
+    """The stack with the function, its log group, its role, its target group and its rule in the listener.
+
+    The function reads public keys, roster and deny list from the artifact bucket.
+    """
 
     def __init__(
         self,
@@ -76,7 +79,7 @@ class ServerlessStack(cdk.Stack):
         self._behind_the_load_balancer(names, function)
 
     def _behind_the_load_balancer(self, names: ResourceNames, function: lambda_.Function) -> None:
-        # By name: the target group takes a function only if it may invoke it already.
+        # The permission names the target group, because it must exist before the target group does.
         permission = lambda_.CfnPermission(
             self, "OfLoadBalancer", action="lambda:InvokeFunction", function_name=function.function_arn,
             principal="elasticloadbalancing.amazonaws.com", source_account=self.account,
@@ -84,12 +87,12 @@ class ServerlessStack(cdk.Stack):
                 service="elasticloadbalancing", resource="targetgroup", resource_name=f"{names.function}/*"
             ),
         )  # fmt: skip
-        # No health checks: each would be a paid call.
+        # No health checks, because each would be a paid call of the function.
         targets = elbv2.CfnTargetGroup(
             self, "Targets", name=names.function, target_type="lambda", health_check_enabled=False,
             targets=[elbv2.CfnTargetGroup.TargetDescriptionProperty(id=function.function_arn)],
             target_group_attributes=[
-                # The function receives all values of a repeated header, and can refuse it.
+                # The function gets all values of a repeated header, so that it can refuse the request.
                 elbv2.CfnTargetGroup.TargetGroupAttributeProperty(
                     key="lambda.multi_value_headers.enabled", value="true"
                 )
@@ -97,7 +100,7 @@ class ServerlessStack(cdk.Stack):
         )  # fmt: skip
         targets.add_dependency(permission)
         elbv2.CfnListenerRule(
-            self, "Rule", listener_arn=read(self, names, "backend/listener"), priority=_PRIORITY,
+            self, "Rule", listener_arn=read(self, names, "backend/listener"), priority=_RULE_PRIORITY,
             conditions=[
                 elbv2.CfnListenerRule.RuleConditionProperty(
                     field="path-pattern",

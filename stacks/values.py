@@ -1,8 +1,8 @@
-"""Hand values from one stack to another through SSM parameters with fixed names.
+"""Pass values from one stack to another through SSM parameters with fixed names.
 
-CloudFormation's exports are not used: it refuses to change or remove an export as long as another stack
-imports it, so that a switch such as ``data.enabled`` could be turned on and never off again.  A parameter
-may change or be removed at any time; the reader sees it at its own next update.
+Exports are not used: CloudFormation refuses to change or remove an export while another stack imports it, so
+that a setting such as ``data.enabled`` could be turned on and never off again.  A parameter may change or be
+removed at any time; the stack that reads it sees the change at its own next update.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ from rse_pf.config.resource_names import ResourceNames
 
 __all__ = ["import_bucket", "import_group", "import_network", "provide", "provide_network", "read"]
 
-_TYPE = "AWS::SSM::Parameter::Value<String>"
+_TYPE = "AWS::SSM::Parameter::Value<String>"  # CloudFormation reads the SSM parameter at each deployment
 
 
 def provide(scope: Construct, names: ResourceNames, path: str, value: str) -> None:
-    """Write *value* into the parameter *path*, such as ``data/maps``, for `read` in another stack."""
+    """Add an SSM parameter with *value* to the stack of *scope*; other stacks `read` it by *path*.
+
+    *path* is a short name such as ``data/maps``.
+    """
     stack = cdk.Stack.of(scope)
     ssm.CfnParameter(
         stack, f"{_identity(path)}Value", type="String", name=names.parameter(path), value=value,
@@ -30,9 +33,10 @@ def provide(scope: Construct, names: ResourceNames, path: str, value: str) -> No
 
 
 def read(scope: Construct, names: ResourceNames, path: str) -> str:
-    """Return the value that another stack provides as *path*; known when this stack is deployed.
+    """Return the value that another stack provides as *path*, as a token that the deployment resolves.
 
-    The logical id is *path* in camel case, such as ``DataMaps``, without a hash: findings can name it.
+    The logical id of the CloudFormation parameter is *path* in camel case, such as ``DataMaps``, without a
+    hash, so that acknowledged findings can name it.
     """
     stack = cdk.Stack.of(scope)
     existing = stack.node.try_find_child(_identity(path))
@@ -54,7 +58,7 @@ def import_group(scope: Construct, names: ResourceNames, name: str) -> ec2.ISecu
 
 
 def provide_network(scope: Construct, names: ResourceNames, vpc: ec2.Vpc) -> None:
-    """Write what `import_network` reads."""
+    """Provide the ids of *vpc* and of its subnets for `import_network` in other stacks."""
     provide(scope, names, "network/vpc", vpc.vpc_id)
     for kind, subnets in (("front", vpc.public_subnets), ("servers", vpc.isolated_subnets)):
         for at, subnet in enumerate(subnets):
@@ -66,8 +70,9 @@ def import_network(
 ) -> ec2.IVpc:
     """Return the VPC of the network stack, with a public subnet in each of *zones* zones.
 
-    Servers are in the first *server_zones* of them; the subnets beyond are those again, because the CDK wants
-    as many as zones, and a parameter that no resource reads is a finding.
+    Servers use the isolated subnets of the first *server_zones* zones.  The CDK requires an isolated subnet
+    for each zone, and a parameter that no resource uses is a finding; therefore these subnets are repeated
+    for the other zones.  *cidr* is the address range of the VPC.
     """
     front = [read(scope, names, f"network/front-{at}") for at in range(zones)]
     servers = [read(scope, names, f"network/servers-{at % server_zones}") for at in range(zones)]
@@ -76,11 +81,11 @@ def import_network(
         availability_zones=[cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(zones)],
         public_subnet_ids=front, isolated_subnet_ids=servers,
     )  # fmt: skip
-    # Nothing outside of the network stack adds a route.
+    # The route tables are not needed here: only the network stack adds routes.
     cdk.Annotations.of(vpc).acknowledge_warning("@aws-cdk/aws-ec2:noSubnetRouteTableId", "no route is added")
     return vpc
 
 
 def _identity(path: str) -> str:
-    """Return *path* in camel case: letters and digits are all that a logical id may hold."""
+    """Return *path* in camel case, because a logical id may hold letters and digits only."""
     return "".join(word.capitalize() for word in path.replace("/", "-").split("-"))

@@ -1,9 +1,9 @@
-"""The web application firewall in front of the load balancer: rate limits of each address.
+"""The web application firewall in front of the load balancer: rate limits of each client address.
 
-The limits come from `rse_pf.config.front_door`.  Blocked requests get 429 with ``Retry-After`` and never 403:
-robots retry after 429, and treat 403 as the permanent refusal of a server.
-Commands for the burst function must carry what looks like a token, because each call of it is paid; this rule
-comes first, so that requests without a token do not count in the rate of all robots.
+The limits come from `rse_pf.config.front_door`.  Requests above a limit get 429 with ``Retry-After`` and
+never 403: robots retry after 429, and treat 403 as the permanent refusal of a server.  Requests to the
+serverless PnP without a header in the form of a bearer token get 401, because each call of that function is
+paid; this rule comes first, so that such requests do not count in the rate of all robots.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from rse_pf.config.resource_names import ResourceNames
 
 __all__ = ["WebFirewall"]
 
-_BODY = "too-fast"
-_BODY_TEXT = {
+_RATE_BODY = "too-fast"  # name in the web ACL of the body of replies to requests above a rate limit
+_RATE_TEXT = {
     "code": "quota",
     "message": "too many requests",
     "hint": (
@@ -36,7 +36,7 @@ _BODY_TEXT = {
     ),
 }
 _BURST_RULE = "burst-needs-a-token"
-_UNAUTHORIZED_BODY = "no-token"
+_UNAUTHORIZED_BODY = "no-token"  # name in the web ACL of the body of replies to requests without a token
 _UNAUTHORIZED_STATUS = 401
 _UNAUTHORIZED_TEXT = {
     "code": "unauthorized", "message": "the token is missing or not valid",
@@ -45,7 +45,7 @@ _UNAUTHORIZED_TEXT = {
 
 
 class WebFirewall(Construct):
-    """A web ACL of rate rules for the load balancer *alb_arn*."""
+    """A web ACL (a list of rules of AWS WAF) with the rate rules, attached to the load balancer *alb_arn*."""
 
     def __init__(
         self, scope: Construct, construct_id: str, *, alb_arn: str, settings: PlatformSettings
@@ -56,8 +56,8 @@ class WebFirewall(Construct):
             self, "Acl", scope="REGIONAL", visibility_config=_metrics_only(names.firewall),
             default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
             custom_response_bodies={
-                _BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
-                    content=json.dumps(_BODY_TEXT), content_type="APPLICATION_JSON"
+                _RATE_BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
+                    content=json.dumps(_RATE_TEXT), content_type="APPLICATION_JSON"
                 ),
                 _UNAUTHORIZED_BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
                     content=json.dumps(_UNAUTHORIZED_TEXT), content_type="APPLICATION_JSON"
@@ -77,7 +77,7 @@ def _rule(prefix: str, place: int, rule: RateRule) -> wafv2.CfnWebACL.RuleProper
         action=wafv2.CfnWebACL.RuleActionProperty(
             block=wafv2.CfnWebACL.BlockActionProperty(
                 custom_response=wafv2.CfnWebACL.CustomResponseProperty(
-                    response_code=STATUS, custom_response_body_key=_BODY,
+                    response_code=STATUS, custom_response_body_key=_RATE_BODY,
                     response_headers=[
                         wafv2.CfnWebACL.CustomHTTPHeaderProperty(name="Retry-After", value=str(RETRY_AFTER_S))
                     ],
@@ -87,15 +87,18 @@ def _rule(prefix: str, place: int, rule: RateRule) -> wafv2.CfnWebACL.RuleProper
         statement=wafv2.CfnWebACL.StatementProperty(
             rate_based_statement=wafv2.CfnWebACL.RateBasedStatementProperty(
                 aggregate_key_type="CONSTANT" if rule.of_all else "IP", limit=rule.limit,
-                evaluation_window_sec=rule.window_s, scope_down_statement=_scope(rule),
+                evaluation_window_sec=rule.window_s, scope_down_statement=_statement_of_paths(rule),
             )
         ),
     )  # fmt: skip
 
 
 def _burst_token_rule(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
-    """Return the rule that keeps calls without a token away from the function, whose every call is paid."""
-    looks_right = wafv2.CfnWebACL.StatementProperty(
+    """Return the rule that blocks requests to the serverless PnP without a header in the form of a token.
+
+    Each call of that function is paid.
+    """
+    has_bearer_token = wafv2.CfnWebACL.StatementProperty(
         regex_match_statement=wafv2.CfnWebACL.RegexMatchStatementProperty(
             field_to_match=wafv2.CfnWebACL.FieldToMatchProperty(single_header={"Name": "authorization"}),
             regex_string=BEARER_PATTERN,
@@ -103,7 +106,7 @@ def _burst_token_rule(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
         )
     )
     other = wafv2.CfnWebACL.StatementProperty(
-        not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=looks_right)
+        not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=has_bearer_token)
     )
     return wafv2.CfnWebACL.RuleProperty(
         name=_BURST_RULE, priority=place, visibility_config=_metrics_only(f"{prefix}-{_BURST_RULE}"),
@@ -122,7 +125,7 @@ def _burst_token_rule(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
     )  # fmt: skip
 
 
-def _scope(rule: RateRule) -> wafv2.CfnWebACL.StatementProperty:
+def _statement_of_paths(rule: RateRule) -> wafv2.CfnWebACL.StatementProperty:
     if rule.paths:
         return _path_begins_with_one_of(rule.paths)
     return wafv2.CfnWebACL.StatementProperty(
@@ -132,7 +135,7 @@ def _scope(rule: RateRule) -> wafv2.CfnWebACL.StatementProperty:
 
 def _path_begins_with_one_of(paths: tuple[str, ...]) -> wafv2.CfnWebACL.StatementProperty:
     statements = [_path_begins_with(path) for path in paths]
-    if len(statements) == 1:  # an or of one statement is invalid
+    if len(statements) == 1:  # AWS refuses an OrStatement with a single statement
         return statements[0]
     return wafv2.CfnWebACL.StatementProperty(
         or_statement=wafv2.CfnWebACL.OrStatementProperty(statements=statements)
@@ -150,7 +153,7 @@ def _path_begins_with(path: str) -> wafv2.CfnWebACL.StatementProperty:
 
 
 def _metrics_only(name: str) -> wafv2.CfnWebACL.VisibilityConfigProperty:
-    # Samples would show the headers of handshakes, and so the tokens of robots, for hours.
+    # Sampled requests are off: AWS would show their headers, and so the robots' tokens, for hours.
     return wafv2.CfnWebACL.VisibilityConfigProperty(
         cloud_watch_metrics_enabled=True, metric_name=name, sampled_requests_enabled=False
     )

@@ -1,9 +1,9 @@
 #!/usr/bin/python3
-"""Fetch a backend server's package, verify it, let it install itself; cloud-init runs this once, as root.
+"""Fetch a backend server's package, verify it, and run its install.py; cloud-init runs this once, as root.
 
-Standard library alone: credentials from IMDSv2, requests signed with SigV4.  Promises no address but IMDS, S3
-and Auto Scaling, and that not one byte is written or run that the template's digest does not vouch for.  A
-boot that fails writes its last lines to the console and abandons the launch: the group replaces the machine.
+Uses the standard library only: credentials come from IMDSv2, and requests are signed with SigV4.  It connects
+to IMDS, S3 and Auto Scaling only, and writes or runs only files whose digests match the template's.  A failed
+boot writes its last lines to the console and abandons the launch, so that the group replaces the machine.
 """
 
 import collections
@@ -24,18 +24,18 @@ import zipfile
 
 __all__ = ["abandon", "main", "signed_headers", "verified"]
 
-IMDS = "http://169.254.169.254/latest/"
-PACKAGE = pathlib.Path("/opt/rse-pf/package")
-SUMS = "SHA256SUMS"
-PAUSE_S = 5.0
+IMDS = "http://169.254.169.254/latest/"  # instance metadata service
+PACKAGE = pathlib.Path("/opt/rse-pf/package")  # folder into which the package is unpacked
+SUMS = "SHA256SUMS"  # file in the package with the digests of all other files
+PAUSE_S = 5.0  # seconds between two attempts to fetch the package
 CONSOLE = pathlib.Path("/dev/console")
-LINES = collections.deque(maxlen=20)
+LAST_LINES = collections.deque(maxlen=20)  # the log lines that are written to the console after a failure
 
 
 def signed_headers(host, target, region, credentials, now, service="s3"):
-    """Return the headers of a GET that *service* accepts (Signature Version 4).
+    """Return the headers of a GET request to an AWS service, signed with Signature Version 4.
 
-    *target* is the path of the request, with its query if it has one.
+    *target* is the path of the request, with its query if it has one; *now* is UTC.
     """
     path, _, query = target.partition("?")
     stamp, day = now.strftime("%Y%m%dT%H%M%SZ"), now.strftime("%Y%m%d")
@@ -59,9 +59,9 @@ def signed_headers(host, target, region, credentials, now, service="s3"):
 
 
 def verified(data, sha256):
-    """Return the zip archive *data* once every file in it is vouched for.
+    """Return the zip archive *data* after its files were verified; else raise SystemExit.
 
-    *sha256* is the digest of its list of sums, which names each other file exactly once.
+    *sha256* is the digest of the file `SUMS` in the archive, which has the digest of each other file.
     """
     archive = zipfile.ZipFile(io.BytesIO(data))
     sums = archive.read(SUMS) if SUMS in archive.namelist() else b""
@@ -78,18 +78,22 @@ def verified(data, sha256):
 
 
 def main(facts):
-    """Fetch, verify, install; report a failure to the console and the group, which replaces the machine."""
+    """Fetch, verify and install the package; *facts* come from `stacks.backend_servers`.
+
+    After a failure write the last lines to the console, abandon the launch and exit with 1: the group
+    replaces the machine.
+    """
     try:
         install(facts)
     except BaseException as error:
         say(f"first boot: failed: {type(error).__name__}: {error}")
-        tell_console()
+        write_console()
         abandon(facts)
         raise SystemExit(1) from error
 
 
 def install(facts):
-    """Fetch and verify the package, and run its install.py."""
+    """Fetch and verify the package, unpack it, and run its install.py; raise SystemExit if that fails."""
     data, server = retry_for(lambda: fetched(facts), float(facts["retry_s"]))
     PACKAGE.mkdir(parents=True, exist_ok=True)
     verified(data, facts["sha256"]).extractall(PACKAGE)
@@ -99,11 +103,11 @@ def install(facts):
         for line in running.stdout:
             say(line.rstrip())
     if running.returncode:
-        raise SystemExit(f"install.py ended with {running.returncode}")
+        raise SystemExit(f"install.py exited with {running.returncode}")
 
 
 def fetched(facts):
-    """Return the package's bytes and the name of this instance."""
+    """Return the package's bytes and the id of this instance."""
     token = imds("api/token")
     bucket, _, name = facts["package"].split("://", 1)[1].partition("/")
     host = f"{bucket}.s3.{facts['region']}.{facts['domain']}"
@@ -111,7 +115,10 @@ def fetched(facts):
 
 
 def abandon(facts):
-    """Tell the group that this launch failed; without it the hook's own timeout ends the machine."""
+    """Complete the launch hook with ABANDON, so that the group replaces this machine at once.
+
+    If the call fails, the hook's own timeout has the same effect.
+    """
     try:
         token = imds("api/token")
         call = {
@@ -126,7 +133,7 @@ def abandon(facts):
 
 
 def asked(host, target, facts, token, service="s3"):
-    """Return the answer to a GET, signed as the instance's role."""
+    """Return the body of the answer to a GET request, signed with the credentials of the instance's role."""
     role = imds("meta-data/iam/security-credentials/", token).split()[0]
     credentials = json.loads(imds("meta-data/iam/security-credentials/" + role, token))
     now = datetime.datetime.now(datetime.timezone.utc)
@@ -137,7 +144,7 @@ def asked(host, target, facts, token, service="s3"):
 
 
 def imds(path, token=None):
-    """Return a fact of this instance, or a session token when there is none yet."""
+    """Return the text of the instance metadata at *path*; without *token*, request a new session token."""
     request = urllib.request.Request(IMDS + path, method="GET" if token else "PUT")
     if token:
         request.add_header("X-aws-ec2-metadata-token", token)
@@ -148,7 +155,10 @@ def imds(path, token=None):
 
 
 def retry_for(call, within_s):
-    """Return what *call* returns; roles and endpoints may come a little later than the machine."""
+    """Return the result of *call*; repeat it after an error, for at most *within_s* seconds.
+
+    The role and the endpoints may become available a little later than the machine.
+    """
     until = time.monotonic() + within_s
     while True:
         try:
@@ -161,12 +171,12 @@ def retry_for(call, within_s):
 
 
 def say(line):
-    """Write *line* to cloud-init's log, and keep it."""
+    """Write *line* to cloud-init's log, and keep it for `write_console`."""
     sys.stderr.write(line + "\n")
-    LINES.append(line)
+    LAST_LINES.append(line)
 
 
-def tell_console():
-    """Write the last lines to the console, which outlives the machine: aws ec2 get-console-output."""
+def write_console():
+    """Write the last lines to the console; AWS keeps it after the machine (aws ec2 get-console-output)."""
     with contextlib.suppress(OSError):
-        CONSOLE.write_text("".join(f"rse-pf: {line}\r\n" for line in LINES), encoding="utf-8")
+        CONSOLE.write_text("".join(f"rse-pf: {line}\r\n" for line in LAST_LINES), encoding="utf-8")

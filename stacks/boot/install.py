@@ -1,10 +1,10 @@
 #!/usr/bin/python3
 """Install a backend server on a plain Debian 12 machine; first_boot.py runs this file of the package as root.
 
-Uses the standard library only.  Unpacks the archives in the folder of this file, which first_boot.py has
-verified, into a virtual environment with its bytecode, and starts the units.  A second run has the same
-result.  The server, its agent, the data service and the rosbridge server run as a user who may write one
-folder.
+Uses the standard library only.  It unpacks the archives in the folder of this file, which first_boot.py has
+verified, into a virtual environment, and starts the systemd units.  A second run has the same result.  The
+server, its agent, the data service and the rosbridge server run as the user rse-pf, who may write only its
+state folder and its folder in memory.
 """
 
 import json
@@ -18,27 +18,32 @@ __all__ = ["environment_file", "main", "units_of"]
 
 PACKAGE = pathlib.Path(__file__).resolve().parent
 HOME = PACKAGE.parent
-USER = "rse-pf"
+USER = "rse-pf"  # system user of all servers
 UNITS = pathlib.Path("/etc/systemd/system")
 CONFIGURATION = pathlib.Path("/etc/rse-pf")
 VENV = HOME / "venv"
+# The parts of the virtual environment, unpacked at the same time.
 ARCHIVES = ("libraries-0.tar.gz", "libraries-1.tar.gz", "platform.tar.gz")
 AGENT = "rse-pf-agent.service"
-ALWAYS = ("rse-pf.service", AGENT)
+ALWAYS = ("rse-pf.service", AGENT)  # units that start whatever the settings say
 DATA = "rse-pf-data.service"
 ROSBRIDGE = "rse-pf-rosbridge.service"
 
 
 def units_of(settings):
-    """Return the units that start with the machine, for merged *settings* (group to names to values)."""
+    """Return the systemd units to start, for *settings* (a dict of groups, each a dict of values by name).
+
+    The data service and the rosbridge server are started only if the settings enable them.
+    """
     data = (DATA,) if settings["data"]["enabled"] else ()
     return (*ALWAYS, *data, ROSBRIDGE) if settings["serving"]["rosbridge"] else (*ALWAYS, *data)
 
 
 def environment_file(facts):
-    """Return the environment file of the units: names of this server, its group and its buckets.
+    """Return the text of the units' environment file, with a line VARIABLE=VALUE for each of eight *facts*.
 
-    *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook``, ``launch``, ``store`` and ``audit``.
+    These are ``server``, ``bucket``, ``keys``, ``group``, ``hook``, ``launch``, ``store`` and ``audit``.
+    Raise SystemExit if one of them is empty or has spaces, quotes or other special characters.
     """
     names = {
         "SERVER_ID": "server", "BUCKET": "bucket", "KEYS_NAME": "keys", "GROUP": "group", "HOOK": "hook",
@@ -51,7 +56,7 @@ def environment_file(facts):
 
 
 def main(facts):
-    """Install everything; any failure ends the boot, and the group replaces the machine."""
+    """Install and start everything; an error makes the boot fail, and the group replaces the machine."""
     settings = json.loads((PACKAGE / "settings.json").read_text(encoding="utf-8"))["context"]["rse-pf"]
     if subprocess.run(["/usr/bin/id", USER], capture_output=True, check=False).returncode:
         run("/usr/sbin/useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
@@ -67,7 +72,11 @@ def main(facts):
 
 
 def unpack(about):
-    """Make the virtual environment of the archives; *about* says which Python they are for."""
+    """Unpack the archives into a new virtual environment, and compile bytecode unless they hold it.
+
+    *about* is the content of environment.json.  Raise SystemExit if the archives are for another Python
+    version than that of the machine.
+    """
     if about["python"] != ".".join(map(str, sys.version_info[:2])):
         raise SystemExit(
             f"install: the environment is for Python {about['python']}, "
@@ -86,7 +95,7 @@ def unpack(about):
 
 
 def run(*command):
-    """Run *command*; its output goes to the machine's console."""
+    """Run *command*, whose output goes to the log of the boot; raise CalledProcessError if it fails."""
     subprocess.run(command, check=True)
 
 
