@@ -1,7 +1,7 @@
-"""Answer one HTTP event, with keys, settings and time as arguments.
+"""Answer one HTTP event of AWS Lambda; keys, settings and time are arguments.
 
-Nothing is decoded before the token is verified.  Every event, whatever it holds, gets a result or a typed
-failure.
+No body is decoded before the token is verified.  Every event, whatever it holds, gets a result or an error
+with a code.
 """
 
 from __future__ import annotations
@@ -41,15 +41,16 @@ from rse_pf.wire.server_codec import make_server_codec
 __all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
 _ROOT = Path(__file__).resolve().parents[1]
-_SERVER = "lambda"
-# How long a revoked token may still be accepted while S3 answers: no connection could be closed earlier.
+_SERVER_NAME = "lambda"  # the id of the server in answers of this function
+# Longest period between two fetches of keys, roster and deny list, in seconds: for about this time the
+# function may still accept a revoked token.
 _MAX_STALE_S = 30.0
-# Headers of one request: robots send about ten.
+# Most headers of one request; robots send about ten.
 _MAX_HEADERS = 200
-# Scope that every token needs here; without it the body is not decoded.
+# Scope that every token needs; the body of a request without it is not decoded.
 _REQUIRED_SCOPE = "services:pnp"
-# Headers that the function reads.
-_READ_HEADERS = ("authorization", "content-type")
+# Headers that the function uses, so that a request must not repeat them.
+_USED_HEADERS = ("authorization", "content-type")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,9 +62,12 @@ class LambdaAnswer:
     body: bytes
 
     def as_http(self, event: object, *, init_ms: float, cold: bool) -> dict[str, Any]:
-        """Return the response to *event*, with ``init_ms`` and ``cold`` as headers.
+        """Return this answer as the response of the function to *event*.
 
-        A load balancer wants headers in the form in which it sent its own: one value each, or lists.
+        Args:
+            event: The event; a load balancer wants headers in the form of the event: single values or lists.
+            init_ms: Time of the cold start in ms, 0 without one; becomes the header x-rse-pf-init-ms.
+            cold: Whether this execution environment was new; becomes the header x-rse-pf-cold.
         """
         headers = {
             "content-type": self.content_type,
@@ -84,7 +88,7 @@ class LambdaAnswer:
 
 
 class Answering:
-    """Keys and settings of one execution, and the service that it offers."""
+    """Answers the events of one execution environment, with its keys and settings, by the PnP service."""
 
     def __init__(
         self,
@@ -106,7 +110,14 @@ class Answering:
     def answer(
         self, event: Mapping[str, Any], *, now_s: float, left_ms: float, clock: Callable[[], float]
     ) -> LambdaAnswer:
-        """Answer *event* at Unix time *now_s*, with *left_ms* before the time-out; *clock* is in seconds."""
+        """Return the answer to *event*: 400 or 401 without a valid head, else 200 with a result or failure.
+
+        Args:
+            event: Event of a load balancer or a Function URL.
+            now_s: Unix time, with which the token is verified.
+            left_ms: Time before Lambda ends this execution; an answer that is later is Expired.
+            clock: Monotonic seconds.
+        """
         arrived = clock()
         try:
             headers, body = _read(event)
@@ -123,7 +134,7 @@ class Answering:
                 raise _forbidden_error(_REQUIRED_SCOPE)
             data = self._decode(body)
         except RsePfError as error:
-            return self._encode(codec, failure_of(error, server=_SERVER))
+            return self._encode(codec, failure_of(error, server=_SERVER_NAME))
         try:
             message = codec.decode_from_robot(data)
             if not isinstance(message, Command):
@@ -131,7 +142,7 @@ class Answering:
                     "this is not a command", hint="send commands only; this function has no sessions"
                 )
         except RsePfError as error:
-            failure = failure_of(error, server=_SERVER)
+            failure = failure_of(error, server=_SERVER_NAME)
             return self._encode(codec, structs.replace(failure, id=undecodable_id(codec, data)))
         allowed_ms = self._settings.session.answer_timeout_s * 1e3
         allowed_ms = min(left_ms, allowed_ms if message.deadline_ms is None else message.deadline_ms)
@@ -139,8 +150,8 @@ class Answering:
             return self._encode(codec, self._deadline_failure(message))
         if not scopes_allow(claims.scopes, f"services:{message.service}"):
             forbidden = _forbidden_error(f"services:{message.service}")
-            return self._encode(codec, failure_of(forbidden, message, server=_SERVER))
-        answer = dispatch(self._registry, message, clock, server=_SERVER)
+            return self._encode(codec, failure_of(forbidden, message, server=_SERVER_NAME))
+        answer = dispatch(self._registry, message, clock, server=_SERVER_NAME)
         if (clock() - arrived) * 1e3 > allowed_ms:
             answer = self._deadline_failure(message)
         self._log(
@@ -161,7 +172,12 @@ class Answering:
         return self._codecs[name]
 
     def _decode(self, body: str | bytes) -> bytes:
-        """Return the message of a body; a ``str`` is base64, whose length is checked first."""
+        """Return the bytes of *body*; decode a ``str`` as base64.
+
+        Raises:
+            LimitExceeded: A ``str`` is longer than the base64 of ``session.max_message_bytes``.
+            BadMessage: A ``str`` is not base64.
+        """
         if isinstance(body, bytes):
             return body
         max_bytes = self._settings.session.max_message_bytes
@@ -175,7 +191,7 @@ class Answering:
     @staticmethod
     def _deadline_failure(command: Command) -> Any:
         error = Expired("the deadline passed before the answer was ready", hint="set a longer deadline_s")
-        return failure_of(error, command, server=_SERVER)
+        return failure_of(error, command, server=_SERVER_NAME)
 
     @staticmethod
     def _encode(codec: Codec, message: Any) -> LambdaAnswer:
@@ -199,10 +215,12 @@ def _error_answer(error: RsePfError) -> LambdaAnswer:
 
 
 def _read(event: object) -> tuple[dict[str, str], str | bytes]:
-    """Return the headers, names in small letters, and the body of *event*: base64 as ``str``, else bytes.
+    """Return the headers of *event*, with names in small letters, and its body.
+
+    The body is a ``str`` if *event* says that it is base64, else bytes.
 
     Raises:
-        BadMessage: *event* is not one of a Function URL.
+        BadMessage: *event* is not an event of a load balancer or a Function URL.
     """
     if not isinstance(event, Mapping):
         raise _bad_event("it is not an object")
@@ -218,7 +236,12 @@ def _read(event: object) -> tuple[dict[str, str], str | bytes]:
 
 
 def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the headers, names in small letters; a repeated header that is read is an error."""
+    """Return the headers of *event*, with names in small letters; repeated headers are left out.
+
+    Raises:
+        BadMessage: Names or values are no texts, there are too many headers, or one of `_USED_HEADERS` is
+            repeated.
+    """
     lists = event.get("multiValueHeaders")
     headers = lists or event.get("headers") or {}
     if not isinstance(headers, Mapping) or len(headers) > _MAX_HEADERS:
@@ -230,7 +253,7 @@ def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
         if not isinstance(name, str) or not (isinstance(value, str) or (lists and isinstance(value, list))):
             raise _bad_event("a header is not a text")
         if name.lower() in lowered or not isinstance(value, str):
-            if name.lower() in _READ_HEADERS:
+            if name.lower() in _USED_HEADERS:
                 raise _bad_event(f"there is more than one {name.lower()}")
             continue
         lowered[name.lower()] = value
@@ -245,7 +268,10 @@ def _bad_event(problem: str) -> BadMessage:
 
 
 def load_answering() -> Answering:
-    """Load what a cold start needs: the settings of the package, the keys of the artifact bucket."""
+    """Return the `Answering` of a new execution environment, with the settings in the package.
+
+    The keys are read from the artifact bucket at the first request.
+    """
     settings = load_settings(_ROOT / "settings.json")
 
     def read(control: str = "") -> str:

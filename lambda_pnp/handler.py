@@ -1,7 +1,8 @@
-"""Answer one command by HTTP, with the bytes of the WebSocket: token, decode, dispatch, encode.
+"""Answer one command of a robot by HTTP: the entry point of the AWS Lambda function.
 
-The token is sent as ``Authorization: Bearer``, the sub-protocol as Content-Type.  Failures are the same as
-those of a backend server.  Only settings and keys are kept between calls.
+The request's body is the message that a robot would send by WebSocket; the token is in ``Authorization:
+Bearer``, the sub-protocol in Content-Type.  Failures are those of a backend server.  Settings and keys are
+kept between calls, and nothing else.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ from lambda_pnp.answering import Answering, LambdaAnswer, load_answering
 
 __all__ = ["handler"]
 
-_IMPORTED_S = time.monotonic()
-_ANSWERING: list[Answering] = []
+_IMPORTED_S = time.monotonic()  # the time of a cold start is counted from here
+_ANSWERING: list[Answering] = []  # empty before the first call in this execution environment, then one
 
 
 def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
-    """Answer one event of a load balancer, or of a Function URL."""
+    """Return the response to one event of a load balancer or a Function URL.
+
+    The first call of an execution environment (a cold start) loads the settings.
+    """
     cold = not _ANSWERING
     if cold:
         _ANSWERING.append(load_answering())

@@ -1,8 +1,8 @@
 """Read the public keys, the roster and the deny list from the artifact bucket, without an AWS SDK.
 
-The package stays small and its import fast.  A function may run for hours, so everything is fetched again
-once in a period.  Each fetch is one signed GET without retries.  While it fails, the previous values are kept
-without a limit in time, as servers do: see docs/decisions/identity.md.
+Without an SDK the package stays small and its import fast.  An execution environment may live for hours, so
+all three are fetched again once in a period, each by one signed GET without retries.  While a fetch fails,
+the previous values are kept without a limit in time, as servers do: see docs/decisions/identity.md.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rse_pf.errors import NotFound, RsePfError, message_of
 
 __all__ = ["KeyCache", "read_object", "signed_request"]
 
-# Time limit of one fetch, in seconds: three of them fit into the time limit of an execution.
-_TIMEOUT_S = 3.0
-# Pause after a failed fetch, in seconds, so that executions do not spend their time on it.
+# Time limit of one GET, in seconds: three of them fit into the function's time limit of 10 s.
+_FETCH_TIMEOUT_S = 3.0
+# Pause after a failed fetch, in seconds, so that not every request waits for a bucket that does not answer.
 _RETRY_PAUSE_S = 5.0
 _NOT_FOUND = 404
 _T = TypeVar("_T", Roster, DenyList)
 
 
 class KeyCache:
-    """The public keys, refreshed once in a period."""
+    """The public keys with roster and deny list, fetched again once in a period."""
 
     def __init__(
         self, read: Callable[[], str], period_s: float, *, read_control: Callable[[str], str] | None = None
@@ -39,9 +39,10 @@ class KeyCache:
         """Describe the cache; nothing is fetched yet.
 
         Args:
-            read: Returns the JWKS.
-            period_s: Time between two fetches.
-            read_control: Returns ``robots.json`` or ``deny.json``; raises NotFound.
+            read: Returns the public keys as a JWKS (JSON).
+            period_s: Seconds between two fetches.
+            read_control: Returns the object ``robots.json`` or ``deny.json``, or raises NotFound; None means
+                that there is neither roster nor deny list.
         """
         self._read = read
         self._read_control = read_control
@@ -51,7 +52,10 @@ class KeyCache:
         self._due_s: float | None = None
 
     def at(self, clock_s: float) -> KeySet:
-        """Return the keys at *clock_s*, in monotonic seconds; empty if none could ever be fetched."""
+        """Return the keys, fetched again if a period has passed by *clock_s* (monotonic seconds).
+
+        If the fetch fails, write a line to stderr and return the previous keys; none if there are none yet.
+        """
         if self._due_s is None or clock_s >= self._due_s:
             try:
                 self._keys = KeySet.from_json(self._read()).with_access_control(
@@ -67,7 +71,11 @@ class KeyCache:
         return self._keys
 
     def _access_control(self, name: str, kind: type[_T]) -> _T:
-        """Return the roster or deny list; empty only if it was never written."""
+        """Return the roster or the deny list in the object *name*; an empty one if it was never written.
+
+        Raises:
+            NotFound: The object was there at an earlier fetch, so it must not count as empty.
+        """
         if self._read_control is None:
             return kind()
         try:
@@ -81,14 +89,16 @@ class KeyCache:
 
 
 def read_object(environment: Mapping[str, str], now: datetime, control: str = "") -> str:
-    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names, or *control* in its folder ``control``.
+    """Return the text of an object in the artifact bucket; arguments as for `signed_request`.
 
     Raises:
         NotFound: There is no such object.
-        OSError: Anything else.
+        OSError: S3 does not answer, or refuses.
     """
     try:
-        with urllib.request.urlopen(signed_request(environment, now, control), timeout=_TIMEOUT_S) as answer:
+        with urllib.request.urlopen(
+            signed_request(environment, now, control), timeout=_FETCH_TIMEOUT_S
+        ) as answer:
             text: bytes = answer.read()
     except urllib.error.HTTPError as error:
         with error:
@@ -101,12 +111,13 @@ def read_object(environment: Mapping[str, str], now: datetime, control: str = ""
 def signed_request(
     environment: Mapping[str, str], now: datetime, control: str = ""
 ) -> urllib.request.Request:
-    """Return a GET with AWS Signature Version 4, from Lambda's own variables and the time in UTC.
+    """Return a GET request of an object in S3, signed with AWS Signature Version 4.
 
     Args:
-        environment: Of the function.
-        now: UTC.
-        control: Name in the folder ``control`` next to the keys; empty for the keys themselves.
+        environment: Environment variables of the function: ``RSE_PF_KEYS`` is BUCKET/NAME of the public keys;
+            Lambda sets the region and the credentials.
+        now: The time in UTC.
+        control: Name of an object in the folder ``control`` next to the keys; empty means the keys.
     """
     bucket, _, keys = environment["RSE_PF_KEYS"].partition("/")
     name = f"{keys.rpartition('/')[0]}/control/{control}".lstrip("/") if control else keys

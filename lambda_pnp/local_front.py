@@ -2,9 +2,10 @@
 
     python -m lambda_pnp.local_front FOLDER [--port P] [--parent PID]
 
-FOLDER is that of a local platform: its settings and its public keys.  Requests become the events of a load
-balancer.  Each execution answers one command at a time; an idle one is used again, and no more than
-``cloud.lambda_concurrency`` exist.  It is for trials and measurements: it listens on loopback only.
+FOLDER is the folder of a local platform, with its settings and public keys.  Requests become the events of a
+load balancer.  Each execution environment of the function answers one command at a time; an idle one is used
+again, and at most ``cloud.lambda_concurrency`` exist.  The program is for trials and measurements: it listens
+on loopback only.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from rse_pf.terminal import show, show_error, show_json
 __all__ = ["LocalFront", "answering_of", "read_platform_file"]
 
 _HOST = "127.0.0.1"
-_TIMEOUT_S = 10.0  # limit of a body, and of an execution, as stacks/serverless_stack.py sets it
-_STOP_TIMEOUT_S = 1  # uvicorn's limit of the requests that are being answered when the front stops
-_MAX_BODY_BYTES = 1_048_576  # of a request that an ALB passes on to a function
+_EXECUTION_TIMEOUT_S = 10.0  # time limit of an execution, as in stacks/serverless_stack.py, and of a body
+_STOP_TIMEOUT_S = 1  # seconds in which requests in progress may complete when the program stops
+_MAX_BODY_BYTES = 1_048_576  # longest request body that an ALB passes on to a function
 _TOKEN = re.compile(BEARER_PATTERN)
 _Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 
@@ -48,15 +49,15 @@ class LocalFront:
     Attributes:
         answered: Number of requests that an execution answered.
         refused: Number of requests for which no execution was free.
-        executions: Number of executions that were started.
+        executions: Number of execution environments that were started.
     """
 
     def __init__(self, make: Callable[[], Answering], *, most: int) -> None:
-        """Describe the front; nothing is started yet.
+        """Describe the front; no execution environment is started yet.
 
         Args:
-            make: Starts an execution.
-            most: Largest number of executions at a time.
+            make: Starts an execution environment.
+            most: Largest number of execution environments; each answers one request at a time.
         """
         self.answered = self.refused = self.executions = 0
         self._make = make
@@ -70,7 +71,7 @@ class LocalFront:
         receive: _Receive,
         send: Callable[[Mapping[str, Any]], Awaitable[None]],
     ) -> None:
-        """Answer one request."""
+        """Answer one request, or refuse it as the firewall or the load balancer would."""
         status, headers, body = await self._answer(scope, receive)
         fields = [(name.encode(), value.encode()) for name, value in headers.items()]
         fields.append((b"content-length", b"%d" % len(body)))
@@ -78,7 +79,7 @@ class LocalFront:
         await send({"type": "http.response.body", "body": body})
 
     def close(self) -> None:
-        """Start no execution any more."""
+        """Drop the requests that wait for an execution; running executions are not awaited."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _answer(self, scope: Mapping[str, Any], receive: _Receive) -> tuple[int, dict[str, str], bytes]:
@@ -87,7 +88,7 @@ class LocalFront:
         for name, value in scope["headers"]:
             headers.setdefault(name.decode("latin-1"), []).append(value.decode("latin-1"))
         try:
-            body = await asyncio.wait_for(_read_body(headers, receive), _TIMEOUT_S)
+            body = await asyncio.wait_for(_read_body(headers, receive), _EXECUTION_TIMEOUT_S)
         except asyncio.TimeoutError:
             return 408, {}, b""
         if body is None:
@@ -124,13 +125,13 @@ class LocalFront:
         execution = execution or self._make()
         init_ms = (time.monotonic() - began) * 1e3 if is_cold else 0.0
         answer = execution.answer(
-            event, now_s=time.time(), left_ms=_TIMEOUT_S * 1e3, clock=time.monotonic
+            event, now_s=time.time(), left_ms=_EXECUTION_TIMEOUT_S * 1e3, clock=time.monotonic
         ).as_http(event, init_ms=init_ms, cold=is_cold)
         return execution, answer
 
 
 async def _read_body(headers: Mapping[str, list[str]], receive: _Receive) -> bytes | None:
-    """Return the whole body; None if it is too long, or if the client left before its end."""
+    """Return the whole body; None if it is longer than `_MAX_BODY_BYTES`, or if the client disconnected."""
     if int(headers.get("content-length", ["0"])[0]) > _MAX_BODY_BYTES:
         return None
     body, is_complete = b"", False
@@ -144,7 +145,7 @@ async def _read_body(headers: Mapping[str, list[str]], receive: _Receive) -> byt
 
 
 def answering_of(settings: PlatformSettings, folder: Path) -> Callable[[], Answering]:
-    """Return what starts executions with the keys in *folder*."""
+    """Return a function that makes an `Answering` with *settings* and with the public keys in *folder*."""
 
     def make() -> Answering:
         keys = KeyCache(
@@ -157,7 +158,7 @@ def answering_of(settings: PlatformSettings, folder: Path) -> Callable[[], Answe
 
 
 def read_platform_file(folder: Path, name: str = "keys.json") -> str:
-    """Return a file of a platform; raises NotFound if there is none."""
+    """Return the text of the file *name* in the folder of a local platform; raises NotFound."""
     try:
         return (folder / name).read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -165,7 +166,7 @@ def read_platform_file(folder: Path, name: str = "keys.json") -> str:
 
 
 def _serve(folder: Path, port: int) -> None:
-    """Serve the platform in *folder* on loopback until a signal; print the address as JSON."""
+    """Emulate the function for the platform in *folder* until SIGTERM or SIGINT; print the URL as JSON."""
     protocol = bounded_protocol(most_idle=MAX_SILENT)
     import uvicorn
 
@@ -177,14 +178,14 @@ def _serve(folder: Path, port: int) -> None:
         timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, frame: None)  # uvicorn repeats it to itself when it has ended
+        # uvicorn sends the signal to its own process again when it has stopped; this handler ignores that.
+        signal.signal(number, lambda number, frame: None)
     with socket.create_server((_HOST, port), backlog=BACKLOG) as listening:
-        # asyncio does this only for sockets that name their protocol.
+        # asyncio sets TCP_NODELAY only on sockets that name their protocol.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         show_json({"url": f"http://{_HOST}:{listening.getsockname()[1]}{BURST_PATH}"})
-        sys.stdout = (
-            sys.stderr
-        )  # the log of the function; nobody reads more than the first line of the output
+        # The log of the function goes to stderr: the reader of stdout reads only the line with the URL.
+        sys.stdout = sys.stderr
         try:
             uvicorn.Server(config).run(sockets=[listening])
         finally:
@@ -192,7 +193,7 @@ def _serve(folder: Path, port: int) -> None:
 
 
 def main() -> int:
-    """Serve until a signal; print the address as JSON."""
+    """Run the emulation until SIGTERM or SIGINT; return 0, or 2 after an error that was printed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--port", type=int, default=0)
