@@ -1,4 +1,5 @@
-"""Find what is wrong with a drive: its calibration, its times, its images, and how its sensors fit.
+"""Find faults of a recorded drive: wrong calibration, wrong time stamps, bad images, sensors that disagree.
 
-Adjusting a drive with its calibration belongs to `rse_pf.slam`; what the command line prints belongs there.
+The bundle adjustment that estimates the calibration is `rse_pf.slam.self_calibration`; the command
+``rse-pf check`` is `rse_pf.extensions.check`.
 """

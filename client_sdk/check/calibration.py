@@ -1,7 +1,7 @@
-"""Judge the calibration of a drive: focal length, principal point, distortion, and depth against colour.
+"""Check the calibration of a drive: focal length, principal point, distortion, and depth against colour.
 
-Findings come from an adjustment of keyframes with the calibration as unknowns.  What is measured against
-odometry or an IMU is judged in `client_sdk.check.motion`.
+Findings come from a bundle adjustment of keyframes in which the errors of the calibration are unknowns.  The
+comparison with odometry, ground truth or an IMU is in `client_sdk.check.motion`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from client_sdk.check.competition import Explanation, Measured, explain
 from client_sdk.check.drive_model import DepthReading, DriveModel, best_reading, drive_model, nearest_delay
 from client_sdk.check.findings import CannotTell, FaultKind, Finding, matters
 from client_sdk.check.keyframes import FLIPS, KeyframeStore, Tracks, tracks_of
-from client_sdk.check.zooms import judge_zooms
+from client_sdk.check.zooms import check_zooms
 from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import Array, Camera, inverse, log_so3
 from rse_pf.slam.self_calibration import (
@@ -27,151 +27,194 @@ from rse_pf.slam.self_calibration import (
     estimate_part_deviations,
 )
 
-__all__ = ["CalibrationJudgement", "judge_calibration"]
+__all__ = ["CalibrationCheck", "check_calibration"]
 
 _FX, _FY, _CX, _CY, _K1, _OFFSET, _DELAY = range(7)
-_COLOUR = ("fx", "fy", "cx", "cy", "k1", "readout")
-_LEAST_KEYFRAMES = 6
-_INFLATION = 1.5
-_FLOOR = np.array([0.005, 0.005, 2.0, 2.0, 0.006, 0.006, 0.003, 0.01, 0.002])
-"""Deviations that remain of any drive, from what the adjustment does not know: other terms of the lens,
-registration, and errors of depth.  They grow with the residuals of depth."""
-_USUAL_DEPTH_FACTOR = 0.7
-_USUAL = np.array([0.005, 0.005, 2.0, 2.0, 0.01, 0.007, 0.005, 0.03, 0.007])
-_WIDEST = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.03, 0.007])
-"""Deviations of the errors of a good calibration, and of faults.  A rolling shutter and errors of depth that
-grow with depth are no faults."""
-_LEAST = np.array([0.02, 0.02, 6.0, 6.0, 0.045, 0.015, 0.02])
-"""Smaller errors are those of a good calibration."""
-_TOLD = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
-"""A drive that could hide more than this of an unknown cannot tell it."""
-_FEW_DEG = 12.0
-_OF_FEW_PARTS = 1.5
-"""Deviations that come from two to four parts are too small as often as not."""
-_MAINLY, _ALIKE = 0.7, 0.8
-_HARDLY, _LITTLE, _NOISY, _FEW_DEPTHS = 0.01, 0.06, 2.0, 0.2
+_COLOUR_UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "readout")
+# Fewest keyframes, and fewest poses of a camera without depth, with which a calibration is checked.
+_MIN_KEYFRAMES = 6
+# Factor on the standard deviations of the adjustment, which are too small: residuals are correlated.
+_DEVIATION_INFLATION = 1.5
+_MODEL_DEVIATIONS = np.array([0.005, 0.005, 2.0, 2.0, 0.006, 0.006, 0.003, 0.01, 0.002])
+"""Standard deviations, as of `UNKNOWNS`, of errors that the model of the adjustment lacks:
+higher terms of the lens, registration, and errors of depth.  They are multiplied by `_depth_error_factor`."""
+_KINECT_DEPTH_FACTOR = 0.7  # `Calibrated.depth_factor` of a Kinect: its depth noise over the stated noise
+_USUAL_DEVIATIONS = np.array([0.005, 0.005, 2.0, 2.0, 0.01, 0.007, 0.005, 0.03, 0.007])
+"""Standard deviations of the errors of a good calibration, in the order and units of `UNKNOWNS`."""
+_FAULT_DEVIATIONS = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.03, 0.007])
+"""Standard deviations of the errors of a wrong calibration, in the order and units of `UNKNOWNS`.  The last
+two, ``readout`` and ``curve``, are as in `_USUAL_DEVIATIONS`: a rolling shutter and errors that grow with
+depth are not faults."""
+_MIN_ERRORS = np.array([0.02, 0.02, 6.0, 6.0, 0.045, 0.015, 0.02])
+"""Smallest errors that are reported, of the first seven `UNKNOWNS`: good calibrations have smaller ones."""
+_MAX_BOUNDS = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
+"""Largest bounds (three standard deviations), of the first seven `UNKNOWNS`, with which a drive determines an
+error: if its bound is larger, the fault is listed as one that the drive cannot show."""
+# Smallest rotation of the camera about an axis, degrees, that determines focal length and principal point.
+_MIN_ROTATION_DEG = 12.0
+# Factor on the deviations between parts of a drive, which two to four parts often underestimate.
+_PART_INFLATION = 1.5
+# Share of an error's standard deviation from which the parts of the drive are named as its reason.
+_MIN_PART_SHARE = 0.7
+_MIN_CORRELATION = 0.8  # absolute correlation from which two errors of the calibration count as confused
+# Smallest motion of the camera, as a share of the distance of the scene, that determines a calibration.
+_MIN_MOVED_SHARE = 0.01
+_MIN_MOVED_SHARE_FOR_OFFSET = 0.06  # smallest such share that determines an offset of depths
+_MAX_DEPTH_FACTOR = 2.0  # `Calibrated.depth_factor` above which depth noise is named as the reason
+_MIN_DEPTH_SHARE = 0.2  # share of features with a depth below which missing depths are named as the reason
+# Indices of the unknowns that belong to each fault.
 _ROWS = {
     FaultKind.FOCAL_LENGTH: (_FX, _FY), FaultKind.PRINCIPAL_POINT: (_CX, _CY),
     FaultKind.DISTORTION: (_K1,), FaultKind.DEPTH_OFFSET: (_OFFSET,), FaultKind.DEPTH_DELAY: (_DELAY,),
 }  # fmt: skip
-_OF_COLOUR = (FaultKind.FOCAL_LENGTH, FaultKind.PRINCIPAL_POINT, FaultKind.DISTORTION)
-_UNITS = ("%", "%", "px", "px", "", "cm", "s")
-_TIMES = (100.0, 100.0, 1.0, 1.0, 1.0, 100.0, 1.0)
+_COLOUR_FAULTS = (FaultKind.FOCAL_LENGTH, FaultKind.PRINCIPAL_POINT, FaultKind.DISTORTION)
+_UNITS = ("%", "%", "px", "px", "", "cm", "s")  # in which messages state the first seven unknowns
+_UNIT_FACTORS = (100.0, 100.0, 1.0, 1.0, 1.0, 100.0, 1.0)  # from the unit of an unknown to `_UNITS`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CalibrationJudgement:
-    """What the calibration of a drive shows.
+class CalibrationCheck:
+    """The result of checking the calibration of a drive.
 
-    ``noise_m`` is how well the drive tells its path.  ``stamps_s`` ``(k,)`` and ``T_world_camera``
-    ``(k, 4, 4)`` are the keyframes that were adjusted with the calibration, for whoever compares motions;
-    empty where there were too few.  ``metres_deviation``, relative, is how well the calibration tells metres.
+    Attributes:
+        findings: Errors of the calibration.
+        cannot_tell: Faults that the drive does not determine, with the reasons.
+        noise_m: Uncertainty of the adjusted path, root mean square, metres; 0 if nothing was adjusted.
+        scale_deviation: Relative standard deviation of the metric scale of the adjusted path that results
+        from
+            the uncertainty of the calibration; 0 if nothing was adjusted.
+        stamps_s: ``(k,)``, time stamps of the adjusted keyframes; empty if too few keyframes connect.
+        T_world_camera: ``(k, 4, 4)``, poses of these keyframes with the corrected calibration, metres.
     """
 
     findings: tuple[Finding, ...] = ()
     cannot_tell: tuple[CannotTell, ...] = ()
     noise_m: float = 0.0
-    metres_deviation: float = 0.0
+    scale_deviation: float = 0.0
     stamps_s: Array = field(default_factory=lambda: np.empty(0))
     T_world_camera: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
-def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
-    """Return what is wrong with the calibration of a drive."""
+def check_calibration(store: KeyframeStore) -> CalibrationCheck:
+    """Estimate the errors of the calibration of a drive, and report those that are certain and matter.
+
+    A drive with fewer than 6 keyframes, or whose keyframes do not connect, gives no findings; every fault is
+    then listed under ``cannot_tell``.
+    """
     keyframes, has_depth = store.keyframes, store.has_depth or store.has_stereo
-    if len(keyframes) < _LEAST_KEYFRAMES:
-        return _untold(f"{len(keyframes)} views that differ", has_depth=has_depth)
+    if len(keyframes) < _MIN_KEYFRAMES:
+        return _undetermined(f"{len(keyframes)} views that differ", has_depth=has_depth)
     tracks = tracks_of(keyframes)
     reading = best_reading(keyframes, tracks) if store.has_depth else DepthReading()
-    free = UNKNOWNS if store.has_depth else _COLOUR
+    free = UNKNOWNS if store.has_depth else _COLOUR_UNKNOWNS
     try:
-        model, found, reading = _adjusted(store, tracks, reading, free)
-        if model is None or found is None:
-            return _untold(_unconnected(store, reading), has_depth=has_depth)
+        model, adjusted, reading = _adjust_drive(store, tracks, reading, free)
+        if model is None or adjusted is None:
+            return _undetermined(_unconnected(store, reading), has_depth=has_depth)
         zoomed = adjust_with_calibration(
-            model.observed, found.T_camera_world, found.points_world, free, zooms=True, values=found.values,
+            model.observed, adjusted.T_camera_world, adjusted.points_world, free, zooms=True,
+            values=adjusted.values,
         )  # fmt: skip
     except DegenerateGeometry:
-        return _untold("views that do not determine their poses", has_depth=has_depth)
+        return _undetermined("views that do not determine their poses", has_depth=has_depth)
     times_s = np.array([keyframes[row].timestamp_s for row in model.rows])
-    zoom = judge_zooms(zoomed, times_s, found)
+    zoom = check_zooms(zoomed, times_s, adjusted)
     findings = [] if zoom.finding is None else [zoom.finding]
-    found = zoomed if findings else found
-    parts = np.zeros(len(UNKNOWNS)) if findings else estimate_part_deviations(model.observed, found, free)
+    adjusted = zoomed if findings else adjusted
+    parts = np.zeros(len(UNKNOWNS)) if findings else estimate_part_deviations(model.observed, adjusted, free)
     causes = _causes(reading, has_depth=store.has_depth, is_one_camera=not findings)
-    measured = _measured(found, parts, reading, causes)
+    measured = _measured(adjusted, parts, reading, causes)
     explanation = explain(measured)
-    told = [each for each in explanation.causes if not explanation.rivals[each]]
-    doubted: list[FaultKind] = []
+    accepted = [each for each in explanation.causes if not explanation.rivals[each]]
+    ambiguous: list[FaultKind] = []
     if zoom.hint:
-        # What only one focal length for all views explains may be one that moves.
+        # A fault that disappears once each keyframe has its own focal length may be a moving focal length.
         moving = explain(_measured(zoomed, parts, reading, causes)).causes
-        doubted = [each for each in told if each not in moving]
-        told = [each for each in told if each in moving]
-    findings += _findings(measured, explanation.causes, told, found, model, reading)
-    drive = _Drive(measured, explanation, found, model, parts)
-    return CalibrationJudgement(
+        ambiguous = [each for each in accepted if each not in moving]
+        accepted = [each for each in accepted if each in moving]
+    findings += _findings(measured, explanation.causes, accepted, adjusted, model, reading)
+    drive = _Drive(measured, explanation, adjusted, model, parts)
+    return CalibrationCheck(
         findings=tuple(findings),
         cannot_tell=(
             *zoom.cannot_tell,
-            *_doubts(doubted, zoom.hint),
-            *_cannot_tell(
-                drive, reading, told={*doubted, *(each.kind for each in findings)}, has_depth=store.has_depth
+            *_undetermined_by_zoom(ambiguous, zoom.hint),
+            *_undetermined_faults(
+                drive,
+                reading,
+                excluded={*ambiguous, *(each.kind for each in findings)},
+                has_depth=store.has_depth,
             ),
         ),
-        noise_m=found.noise_m,
+        noise_m=adjusted.noise_m,
         stamps_s=times_s,
-        **_path(found, measured, explanation),
+        **_path(adjusted, measured, explanation),
     )
 
 
 class _Path(TypedDict):
     T_world_camera: Array
-    metres_deviation: float
+    scale_deviation: float
 
 
-def _path(found: Calibrated, measured: Measured, explanation: Explanation) -> _Path:
-    """Return the keyframes with the calibration that causes explain, and how well that tells their metres."""
+def _path(adjusted: Calibrated, measured: Measured, explanation: Explanation) -> _Path:
+    """Return the poses of the keyframes with the corrected calibration, and the deviation of their scale."""
     values, _ = measured.under(explanation.causes)
-    # Depths that are too large by an offset look like a scale: metres are doubted by what it may be.
+    # An offset of depths resembles a wrong scale, so its uncertainty counts even if it is not a cause.
     offset = [FaultKind.DEPTH_OFFSET] if FaultKind.DEPTH_OFFSET in measured.causes else []
     _, covariance = measured.under([*explanation.causes, *offset])
-    T_world_camera = inverse(found.T_camera_world)
-    T_world_camera[:, :3, 3] += np.tensordot(values - measured.values, found.bends_m, axes=1)
+    T_world_camera = inverse(adjusted.T_camera_world)
+    T_world_camera[:, :3, 3] += np.tensordot(values - measured.values, adjusted.bends_m, axes=1)
     at = T_world_camera[:, :3, 3] - T_world_camera[:, :3, 3].mean(axis=0)
-    slopes = np.tensordot(found.bends_m, at, axes=2) / max(float((at**2).sum()), 1e-12)
+    slopes = np.tensordot(adjusted.bends_m, at, axes=2) / max(float((at**2).sum()), 1e-12)
     variance = float(slopes @ covariance @ slopes)
-    return _Path(T_world_camera=T_world_camera, metres_deviation=math.sqrt(max(variance, 0.0)))
+    return _Path(T_world_camera=T_world_camera, scale_deviation=math.sqrt(max(variance, 0.0)))
 
 
 def _causes(
     reading: DepthReading, *, has_depth: bool, is_one_camera: bool
 ) -> dict[FaultKind, tuple[int, ...]]:
-    """Return which faults may explain a drive, and the rows of their unknowns."""
-    kinds = list(_OF_COLOUR) if is_one_camera else []
+    """Return the faults that may explain a drive, each with the indices of its unknowns.
+
+    Faults of the colour camera are left out if the drive has two cameras or a moving focal length (not
+    *is_one_camera*), faults of depth without depth images or if these are flipped.
+    """
+    kinds = list(_COLOUR_FAULTS) if is_one_camera else []
     kinds += [FaultKind.DEPTH_OFFSET, FaultKind.DEPTH_DELAY] if has_depth and not reading.flip else []
     return {kind: _ROWS[kind] for kind in kinds}
 
 
 def _measured(
-    found: Calibrated, parts: Array, reading: DepthReading, causes: dict[FaultKind, tuple[int, ...]]
+    adjusted: Calibrated, parts: Array, reading: DepthReading, causes: dict[FaultKind, tuple[int, ...]]
 ) -> Measured:
-    """Return what an adjustment says of the calibration, with what it does not know of its own errors."""
-    values = found.values.copy()
+    """Return the estimated errors of the calibration, with their covariance and their priors.
+
+    *parts* ``(9,)`` are the deviations between parts of the drive, see `estimate_part_deviations`; *causes*
+    are the faults that may explain the drive, see `_causes`.
+    """
+    values = adjusted.values.copy()
     values[_DELAY] += reading.delay_s
-    usual = _USUAL.copy()
+    usual = _USUAL_DEVIATIONS.copy()
     if FaultKind.FOCAL_LENGTH not in causes:
-        usual[: _K1 + 1] = _WIDEST[: _K1 + 1]
+        usual[: _K1 + 1] = _FAULT_DEVIATIONS[: _K1 + 1]
     return Measured(
-        values=values, covariance=_INFLATION**2 * found.covariance + np.diag((_OF_FEW_PARTS * parts) ** 2),
-        unknown=_depth_error_factor(found) * _FLOOR, usual=usual, widest=_WIDEST, causes=causes,
-    )  # fmt: skip
+        values=values,
+        covariance=_DEVIATION_INFLATION**2 * adjusted.covariance + np.diag((_PART_INFLATION * parts) ** 2),
+        unknown=_depth_error_factor(adjusted) * _MODEL_DEVIATIONS,
+        usual=usual,
+        widest=_FAULT_DEVIATIONS,
+        causes=causes,
+    )
 
 
-def _adjusted(
+def _adjust_drive(
     store: KeyframeStore, tracks: Tracks, reading: DepthReading, free: tuple[str, ...]
 ) -> tuple[DriveModel | None, Calibrated | None, DepthReading]:
-    """Adjust a drive, and again with the delay of its depth that this finds, if that is another image."""
+    """Adjust a drive, and repeat it with the depth images at the estimated delay until that is stable.
+
+    The model and the adjustment are None if too few keyframes connect; the reading is the one that was used
+    last.
+    """
     by_depth = store.has_depth or store.has_stereo
     reading = DepthReading(reading.flip, nearest_delay(store.keyframes, reading.delay_s))
     tried_s = [reading.delay_s]
@@ -179,32 +222,36 @@ def _adjusted(
         model = drive_model(store.keyframes, tracks, reading, by_depth=by_depth)
         if model is None:
             return None, None, reading
-        found = adjust_with_calibration(model.observed, model.T_camera_world, model.points_world, free)
-        late_s = nearest_delay(store.keyframes, reading.delay_s + float(found.values[_DELAY]))
+        adjusted = adjust_with_calibration(model.observed, model.T_camera_world, model.points_world, free)
+        late_s = nearest_delay(store.keyframes, reading.delay_s + float(adjusted.values[_DELAY]))
         if reading.flip or late_s in tried_s:
             break
         tried_s.append(late_s)
         reading = DepthReading(delay_s=late_s)
-    return model, found, reading
+    return model, adjusted, reading
 
 
-def _depth_error_factor(found: Calibrated) -> float:
-    """Return how much larger the errors of depth are than the noise of a Kinect, 1 at least."""
-    return max(1.0, found.depth_factor / _USUAL_DEPTH_FACTOR)
+def _depth_error_factor(adjusted: Calibrated) -> float:
+    """Return the ratio of this drive's depth noise to that of a Kinect, at least 1."""
+    return max(1.0, adjusted.depth_factor / _KINECT_DEPTH_FACTOR)
 
 
 def _findings(
-    measured: Measured, causes: tuple[FaultKind, ...], told: list[FaultKind], found: Calibrated,
+    measured: Measured, causes: tuple[FaultKind, ...], accepted: list[FaultKind], adjusted: Calibrated,
     model: DriveModel, reading: DepthReading,
 ) -> list[Finding]:  # fmt: skip
-    """Return the findings of causes that are told from others."""
+    """Return a finding for each of the *accepted* causes that is certain and matters, and one for a flip.
+
+    *causes* are all causes that explain the drive; *accepted* are those without a rival that explains the
+    drive nearly as well.
+    """
     values, covariance = measured.under(causes)
-    errors = _Errors(values, np.sqrt(np.diag(covariance)), found, model.observed.camera)
-    judges = {
+    errors = _Errors(values, np.sqrt(np.diag(covariance)), adjusted, model.observed.camera)
+    finding_of = {
         FaultKind.FOCAL_LENGTH: _focal, FaultKind.PRINCIPAL_POINT: _principal,
         FaultKind.DISTORTION: _distortion, FaultKind.DEPTH_OFFSET: _offset, FaultKind.DEPTH_DELAY: _delay,
     }  # fmt: skip
-    findings = [judges[kind](errors) for kind in told]
+    findings = [finding_of[kind](errors) for kind in accepted]
     if reading.flip:
         findings.append(_flipped(reading))
     return [finding for finding in findings if finding is not None]
@@ -212,28 +259,40 @@ def _findings(
 
 @dataclass(frozen=True, slots=True)
 class _Errors:
-    """``(9,)`` values of the unknowns that causes explain, their deviations, and the drive they are of."""
+    """Errors of the calibration, in the order of `UNKNOWNS`, and the adjustment that estimated them.
+
+    ``values`` ``(9,)`` are the errors and ``deviations`` ``(9,)`` their standard deviations; ``camera`` has
+    the stated intrinsics.
+    """
 
     values: Array
     deviations: Array
-    found: Calibrated
+    adjusted: Calibrated
     camera: Camera
 
     def certain(self, kind: FaultKind) -> tuple[list[int], float]:
-        """Return the rows of a fault that are certain, with its cost; none where it does not matter."""
+        """Return the indices of a fault's unknowns that are certain, and its cost in metres.
+
+        An unknown is certain above three standard deviations and above its entry of `_MIN_ERRORS`.  The list
+        is empty if the fault bends the path by less than `matters` requires; a delay of depth always counts.
+        """
         rows = [
-            row for row in _ROWS[kind] if abs(self.values[row]) > max(3.0 * self.deviations[row], _LEAST[row])
+            row
+            for row in _ROWS[kind]
+            if abs(self.values[row]) > max(3.0 * self.deviations[row], _MIN_ERRORS[row])
         ]
         wrong = np.zeros(len(UNKNOWNS))
         wrong[rows] = self.values[rows]
-        cost_m = self.found.bend_m(wrong)
-        is_kept = matters(cost_m, self.found.noise_m) or kind is FaultKind.DEPTH_DELAY
+        cost_m = self.adjusted.bend_m(wrong)
+        is_kept = matters(cost_m, self.adjusted.noise_m) or kind is FaultKind.DEPTH_DELAY
         return (rows if is_kept else []), cost_m
 
     def with_the_other(self, rows: list[int]) -> list[int]:
-        """Return both focal lengths where one is certain and the other is wrong alike by a deviation.
+        """Return the focal lengths to correct, of those in *rows* that are certain and the other one.
 
-        One of two corrected alone bends a map more: 7.4 cm instead of 6.5 where both were 6 % too small.
+        The other one is added if its error has the same sign and exceeds one standard deviation.  Correcting
+        one of two wrong focal lengths alone bends a map more: 7.4 cm instead of 6.5 cm where both were 6 %
+        too small.
         """
         first = self.values[rows[0]]
         return [
@@ -258,14 +317,14 @@ def _focal(errors: _Errors) -> Finding | None:
         UNKNOWNS[row]: getattr(camera, UNKNOWNS[row]) * math.exp(values[row])
         for row in errors.with_the_other(rows)
     }
-    told = " and ".join(
+    errors_text = " and ".join(
         f"{names[row]} is {abs(relative[row]):.1%} too {_size(relative[row])} (+- {deviations[row]:.1%})"
         for row in rows
     )
     return Finding(
         kind=FaultKind.FOCAL_LENGTH, value=relative[worst], deviation=float(deviations[worst]),
         unit="relative",
-        cost_m=cost_m, sentence=f"the focal length {told}",
+        cost_m=cost_m, sentence=f"the focal length {errors_text}",
         fix="set " + ", ".join(f"{name} = {value:.1f}" for name, value in right.items()),
         correction=right,
     )  # fmt: skip
@@ -278,14 +337,14 @@ def _principal(errors: _Errors) -> Finding | None:
     values, deviations, camera = errors.values, errors.deviations, errors.camera
     worst = errors.worst(rows)
     right = {UNKNOWNS[row]: getattr(camera, UNKNOWNS[row]) + values[row] for row in rows}
-    told = " and ".join(
+    errors_text = " and ".join(
         f"{UNKNOWNS[row]} is {abs(values[row]):.1f} px too {_size(-values[row])} (+- {deviations[row]:.1f})"
         for row in rows
     )
     return Finding(
         kind=FaultKind.PRINCIPAL_POINT, value=-float(values[worst]),
         deviation=float(deviations[worst]), unit="px", cost_m=cost_m,
-        sentence=f"the principal point {told}",
+        sentence=f"the principal point {errors_text}",
         fix="set " + ", ".join(f"{name} = {value:.1f}" for name, value in right.items()),
         correction={name: float(value) for name, value in right.items()},
     )  # fmt: skip
@@ -341,7 +400,7 @@ def _delay(errors: _Errors) -> Finding | None:
     return Finding(
         kind=FaultKind.DEPTH_DELAY, value=delay_s, deviation=deviation_s, unit="s", cost_m=cost_m,
         sentence=(
-            f"{which} is {1e3 * abs(delay_s):.0f} ms late (+- {1e3 * deviation_s:.0f}) beside {other}"
+            f"{which} is {1e3 * abs(delay_s):.0f} ms late (+- {1e3 * deviation_s:.0f}) relative to {other}"
         ),
         fix=(
             f"pair each colour image with the depth image whose stamp is {1e3 * abs(delay_s):.0f} ms "
@@ -354,133 +413,145 @@ def _size(error: float) -> str:
     return "large" if error > 0 else "small"
 
 
-# --- what a drive cannot tell ---
+# --- faults that a drive does not determine, and the reasons ---
 
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """What a drive shows: for reasons of what it does not."""
+    """All results of the adjustment of a drive, from which the reason of an undetermined fault is chosen."""
 
     measured: Measured
     explanation: Explanation
-    found: Calibrated
+    adjusted: Calibrated
     model: DriveModel
     parts: Array
 
 
 def _kinds(*, has_depth: bool) -> tuple[FaultKind, ...]:
-    return tuple(_ROWS) if has_depth else _OF_COLOUR
+    return tuple(_ROWS) if has_depth else _COLOUR_FAULTS
 
 
-def _untold(shown: str, *, has_depth: bool) -> CalibrationJudgement:
-    return CalibrationJudgement(
+def _undetermined(shown: str, *, has_depth: bool) -> CalibrationCheck:
+    """Return a check without findings that gives "the drive has *shown*" as the reason for each fault."""
+    return CalibrationCheck(
         cannot_tell=tuple(CannotTell(kind, f"the drive has {shown}") for kind in _kinds(has_depth=has_depth))
     )
 
 
 def _unconnected(store: KeyframeStore, reading: DepthReading) -> str:
-    """Return why the keyframes of a drive do not connect."""
+    """Return what a drive has too little of for its keyframes to connect, as a phrase for a message."""
     keyframes = store.keyframes
     if store.has_depth or store.has_stereo:
         read = np.concatenate([each.depths_m[reading.flip] for each in keyframes])
         share = float(np.isfinite(read).mean())
-        if share < _FEW_DEPTHS:
+        if share < _MIN_DEPTH_SHARE:
             return f"a depth at {share:.0%} of its features only"
     else:
         posed = sum(each.T_world_camera is not None for each in keyframes)
-        if posed < _LEAST_KEYFRAMES:
+        if posed < _MIN_KEYFRAMES:
             return f"a pose in {posed} of {len(keyframes)} views only"
     return "too few views that share enough features"
 
 
-def _cannot_tell(
-    drive: _Drive, reading: DepthReading, *, told: set[FaultKind], has_depth: bool
+def _undetermined_faults(
+    drive: _Drive, reading: DepthReading, *, excluded: set[FaultKind], has_depth: bool
 ) -> Iterator[CannotTell]:
+    """Yield each fault that the drive does not determine and that is not *excluded*, with the reason."""
     if reading.flip:
-        yield CannotTell(FaultKind.DEPTH_DELAY, "depth images that lie wrong on colour were not tried late")
+        reason = "delays were not tried for depth images that are flipped against the colour images"
+        yield CannotTell(FaultKind.DEPTH_DELAY, reason)
     rivals = {**drive.explanation.rivals}
     for kind in _kinds(has_depth=has_depth):
-        if kind in told or kind not in drive.measured.causes:
+        if kind in excluded or kind not in drive.measured.causes:
             continue
         _, covariance = drive.measured.under([*drive.explanation.causes, kind])
         deviations = np.sqrt(np.diag(covariance))
-        row = max(_ROWS[kind], key=lambda each: deviations[each] / _TOLD[each])
+        row = max(_ROWS[kind], key=lambda each: deviations[each] / _MAX_BOUNDS[each])
         within = 3.0 * float(deviations[row])
         of = next((cause for cause, others in rivals.items() if others and kind in (cause, *others)), None)
         if of is not None:
-            yield CannotTell(kind, _either(drive, of, row), within)
-        elif within > _TOLD[row]:
+            yield CannotTell(kind, _equal_explanations(drive, of, row), within)
+        elif within > _MAX_BOUNDS[row]:
             yield CannotTell(kind, f"{_reason(row, within / 3.0, drive)}: {_bound(row, within)}", within)
 
 
-def _doubts(kinds: list[FaultKind], hint: float) -> Iterator[CannotTell]:
-    """Yield what cannot be told from a focal length that moves by *hint*, relative."""
+def _undetermined_by_zoom(kinds: list[FaultKind], hint: float) -> Iterator[CannotTell]:
+    """Yield the faults *kinds* that may also be a moving focal length, and that fault for each of them.
+
+    *hint* is the relative change of the focal length over the drive.
+    """
     moving = FaultKind.MOVING_FOCAL_LENGTH
     for kind in kinds:
-        yield CannotTell(kind, f"this drive looks alike with {moving.value} (by {hint:+.1%})")
-        yield CannotTell(moving, f"this drive looks alike with {kind.value}")
+        yield CannotTell(kind, f"{moving.value} (by {hint:+.1%}) explains this drive as well")
+        yield CannotTell(moving, f"{kind.value} explains this drive as well")
 
 
-def _either(drive: _Drive, cause: FaultKind, row: int) -> str:
-    """Return that some causes explain a drive alike, and by how much."""
+def _equal_explanations(drive: _Drive, cause: FaultKind, row: int) -> str:
+    """Return a sentence on *cause* and its rivals, which explain the drive equally well."""
     alike = (cause, *drive.explanation.rivals[cause])
     before = [each for each in drive.explanation.causes if each is not cause]
-    told = []
+    explanations = []
     for kind in alike:
         values, _ = drive.measured.under([*before, kind])
-        worst = max(_ROWS[kind], key=lambda each: abs(values[each]) / _LEAST[each])
-        value = _TIMES[worst] * float(values[worst])
-        told.append(f"{kind.value} ({UNKNOWNS[worst]} by {value:+.3g} {_UNITS[worst]}".rstrip() + ")")
-    return f"this drive looks alike with {' and with '.join(told)}"
+        worst = max(_ROWS[kind], key=lambda each: abs(values[each]) / _MIN_ERRORS[each])
+        value = _UNIT_FACTORS[worst] * float(values[worst])
+        explanations.append(f"{kind.value} ({UNKNOWNS[worst]} by {value:+.3g} {_UNITS[worst]}".rstrip() + ")")
+    return f"the drive is explained equally well by {' and by '.join(explanations)}"
 
 
 def _reason(row: int, deviation: float, drive: _Drive) -> str:
-    """Return which motion, or which sight, this drive lacks, with its figure."""
-    found, model = drive.found, drive.model
-    yaw, pitch, roll = _turns_deg(found)
-    moved = _moved_share(found)
-    if moved < _HARDLY and max(yaw, pitch, roll) < _FEW_DEG:
-        return "the camera neither moves nor turns"
-    if found.depth_factor > _NOISY:
-        return f"depths scatter by {found.depth_factor:.1f} times what those of a Kinect do"
+    """Return why the unknown *row* is uncertain by *deviation*: what the drive lacks, with a number.
+
+    The first reason that applies is returned, beginning with a camera that does not move.
+    """
+    adjusted, model = drive.adjusted, drive.model
+    yaw, pitch, roll = _rotation_ranges_deg(adjusted)
+    moved = _moved_share(adjusted)
+    if moved < _MIN_MOVED_SHARE and max(yaw, pitch, roll) < _MIN_ROTATION_DEG:
+        return "the camera neither moves nor rotates"
+    if adjusted.depth_factor > _MAX_DEPTH_FACTOR:
+        return f"depths scatter by {adjusted.depth_factor:.1f} times what those of a Kinect do"
     if row in (_FX, _CX, _FY, _CY):
         about, turned = ("vertical", yaw) if row in (_FX, _CX) else ("horizontal", pitch)
-        if turned < _FEW_DEG:
+        if turned < _MIN_ROTATION_DEG:
             return f"the camera turns by {turned:.0f} degrees only about its {about} axis"
-        if row in (_CX, _CY) and roll < _FEW_DEG:
+        if row in (_CX, _CY) and roll < _MIN_ROTATION_DEG:
             return f"the camera turns by {roll:.0f} degrees only about its optical axis"
-    if moved < (_LITTLE if row == _OFFSET else _HARDLY):
+    if moved < (_MIN_MOVED_SHARE_FOR_OFFSET if row == _OFFSET else _MIN_MOVED_SHARE):
         return f"the camera moves by {moved:.1%} of the depth of what it sees only"
-    if _OF_FEW_PARTS * drive.parts[row] > _MAINLY * deviation:
-        return "parts of the drive, adjusted by themselves, disagree by more than they know"
+    if _PART_INFLATION * drive.parts[row] > _MIN_PART_SHARE * deviation:
+        return "parts of the drive, adjusted alone, disagree by more than their uncertainty"
     if row == _DELAY:
         rate = float(np.median(np.abs(model.observed.rates_m_s)))
         return f"depths at a pixel change by {100 * rate:.0f} cm/s only"
-    correlation = _correlations(found.covariance, row)
+    correlation = _correlations(adjusted.covariance, row)
     other = int(np.argmax(np.abs(correlation)))
-    # Errors that grow with depth look like an offset where all depths are alike.
-    if row == _OFFSET and (UNKNOWNS[other] == "curve" or abs(correlation[other]) <= _ALIKE):
+    # If all depths are similar, an error that grows with depth has the same effect as an offset.
+    if row == _OFFSET and (UNKNOWNS[other] == "curve" or abs(correlation[other]) <= _MIN_CORRELATION):
         depths = model.observed.depths_m[np.isfinite(model.observed.depths_m)]
         low, high = np.percentile(depths, [5, 95])
         return f"depths lie between {low:.1f} and {high:.1f} m"
-    if abs(correlation[other]) > _ALIKE:
+    if abs(correlation[other]) > _MIN_CORRELATION:
         return (
-            f"{UNKNOWNS[row]} looks like {UNKNOWNS[other]} in these views "
+            f"these views do not separate {UNKNOWNS[row]} from {UNKNOWNS[other]} "
             f"(correlation {correlation[other]:+.2f})"
         )
-    return f"{len(found.points_world)} landmarks in {len(model.rows)} views do not tell more"
+    return f"{len(adjusted.points_world)} landmarks in {len(model.rows)} views do not tell more"
 
 
-def _moved_share(found: Calibrated) -> float:
-    """Return how far the camera moves, root mean square, beside the median distance of what it sees."""
-    at = inverse(found.T_camera_world)[:, :3, 3]
+def _moved_share(adjusted: Calibrated) -> float:
+    """Return the RMS distance of the camera from its mean position over the median depth of the landmarks.
+
+    The depth of a landmark is its distance from that mean position.
+    """
+    at = inverse(adjusted.T_camera_world)[:, :3, 3]
     middle = at.mean(axis=0)
     reach = float(np.sqrt(np.square(at - middle).sum(axis=1).mean()))
-    return reach / max(float(np.median(np.linalg.norm(found.points_world - middle, axis=1))), 1e-9)
+    return reach / max(float(np.median(np.linalg.norm(adjusted.points_world - middle, axis=1))), 1e-9)
 
 
 def _correlations(covariance: Array, row: int) -> Array:
-    """Return ``(n,)`` correlations of one unknown with the others, 0 with itself."""
+    """Return ``(n,)`` correlations of the unknown *row* with all unknowns; its own entry is 0."""
     deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     correlations: Array = covariance[row] / (deviations * deviations[row])
     correlations[row] = 0.0
@@ -488,6 +559,7 @@ def _correlations(covariance: Array, row: int) -> Array:
 
 
 def _bound(row: int, within: float) -> str:
+    """Return the bound *within* of the error of an unknown, as a phrase with its name and unit."""
     if row in (_FX, _FY):
         return f"{UNKNOWNS[row]} within {within:.0%}"
     if row in (_CX, _CY):
@@ -497,10 +569,10 @@ def _bound(row: int, within: float) -> str:
     return f"offset within {100 * within:.0f} cm" if row == _OFFSET else f"delay within {within:.2f} s"
 
 
-def _turns_deg(found: Calibrated) -> tuple[float, float, float]:
-    """Return how far the camera turns about its vertical, horizontal and optical axis, between extremes."""
-    R = found.T_camera_world[:, :3, :3]
-    # Of each view beside the middle one, in the camera's axes: x to the right, y down, z ahead.
-    turns = log_so3(R @ R[len(R) // 2].T)
-    x, y, z = np.degrees(np.ptp(turns, axis=0))
+def _rotation_ranges_deg(adjusted: Calibrated) -> tuple[float, float, float]:
+    """Return the ranges of rotation, degrees, about the camera's vertical, horizontal and optical axis."""
+    R = adjusted.T_camera_world[:, :3, :3]
+    # Rotation of each view relative to the middle one, in the camera's axes: x right, y down, z forward.
+    rotations = log_so3(R @ R[len(R) // 2].T)
+    x, y, z = np.degrees(np.ptp(rotations, axis=0))
     return float(y), float(x), float(z)

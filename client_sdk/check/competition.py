@@ -1,7 +1,8 @@
-"""Let causes compete: which faults explain a calibration that was measured, and which it cannot tell apart.
+"""Select the faults that explain the estimated errors of a calibration, and those that explain them equally.
 
-Each cause may have any value while all others are as wrong as those of a good calibration are; causes are
-compared by the squared residuals that they leave.  Nothing is adjusted here.
+This is a forward selection among Gaussian priors: an error that belongs to a selected fault has the wide
+prior of a fault, every other error the narrow prior of a good calibration.  Faults are compared by the
+squared Mahalanobis distance of the estimated errors from 0 under these priors.  Nothing is adjusted here.
 """
 
 from __future__ import annotations
@@ -16,24 +17,26 @@ from rse_pf.geometry import Array
 
 __all__ = ["Explanation", "Measured", "explain"]
 
-_LEAST_GAIN = 12.0
-"""A cause is believed if it takes so much from the sum of squares, in units of the deviations."""
-_LEAST_APART = 9.0
-"""Two causes are told apart by three deviations: if one takes so much more than the other."""
+_MIN_GAIN = 12.0
+"""A fault is selected if it lowers the squared Mahalanobis distance by at least this much."""
+_MIN_DIFFERENCE = 9.0
+"""A fault whose squared Mahalanobis distance exceeds that of the best one by less than this (three standard
+deviations, squared) is its rival: the estimate does not distinguish them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measured:
-    """Errors of a calibration, all of them measured together.
+    """Errors of a calibration that were estimated together, with the priors of their true values.
 
     Attributes:
-        values: ``(n,)``.
-        covariance: ``(n, n)``, of what the drive shows.
-        unknown: ``(n,)`` deviations that remain of any drive, since the model lacks something.
-        usual: ``(n,)`` standard deviations of the errors of a good calibration.  They are not told from what
-            the model lacks, and so do not come on top of it when a cause is judged.
-        widest: ``(n,)`` standard deviations of errors that are faults.
-        causes: Kinds of faults, and the rows of the errors that are each one's.
+        values: ``(n,)``, the estimated errors.
+        covariance: ``(n, n)`` of the estimate.
+        unknown: ``(n,)``, standard deviations of what the model of the estimate lacks, which remain in every
+            drive.
+        usual: ``(n,)``, standard deviations of the errors of a good calibration.  They cannot be separated
+            from *unknown*: `left` takes the larger of both, not their sum.
+        widest: ``(n,)``, standard deviations of errors that are faults.
+        causes: The faults that may explain the errors, each with the indices of its errors.
     """
 
     values: Array
@@ -44,7 +47,10 @@ class Measured:
     causes: Mapping[FaultKind, tuple[int, ...]]
 
     def under(self, causes: Iterable[FaultKind]) -> tuple[Array, Array]:
-        """Return ``(n,)`` values and their ``(n, n)`` covariance where these causes may have any value."""
+        """Return errors ``(n,)`` and their covariance ``(n, n)`` a posteriori, if *causes* are the faults.
+
+        The errors of *causes* have the prior *widest*, all others the prior *usual*.
+        """
         prior = np.diag(self._prior(causes))
         gain = np.linalg.solve(self.covariance + np.diag(self.unknown**2) + prior, prior).T
         values: Array = gain @ self.values
@@ -52,7 +58,7 @@ class Measured:
         return values, covariance
 
     def left(self, causes: Iterable[FaultKind]) -> float:
-        """Return the sum of squares that these causes leave."""
+        """Return the squared Mahalanobis distance of the values from 0, if *causes* are the faults."""
         rows = [row for name in causes for row in self.causes[name]]
         spread = np.square(np.maximum(self.usual, self.unknown))
         spread[rows] = np.square(np.hypot(self.widest, self.unknown))[rows]
@@ -69,10 +75,10 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Explanation:
-    """Causes that explain a measured calibration.
+    """The faults that explain the estimated errors of a calibration.
 
-    ``causes`` are in the order of what they explain; ``rivals`` are those that explain nearly as much in the
-    place of one of them, and nothing beside it.
+    ``causes`` are the selected faults, the one that explains most first.  ``rivals`` maps each of them to the
+    faults that explain nearly as much instead of it, and nothing in addition to it.
     """
 
     causes: tuple[FaultKind, ...] = ()
@@ -80,21 +86,21 @@ class Explanation:
 
 
 def explain(measured: Measured) -> Explanation:
-    """Return the fewest causes that explain what was measured."""
+    """Select faults greedily, until no further one lowers the squared distance by `_MIN_GAIN`."""
     found: list[FaultKind] = []
     rivals: dict[FaultKind, tuple[FaultKind, ...]] = {}
     while True:
         others = [name for name in measured.causes if name not in found]
         left = {name: measured.left([*found, name]) for name in others}
         best = min(left, key=lambda name: left[name], default=None)
-        if best is None or measured.left(found) - left[best] < _LEAST_GAIN:
+        if best is None or measured.left(found) - left[best] < _MIN_GAIN:
             return Explanation(causes=tuple(found), rivals=rivals)
-        # One that still explains something beside the best is a second fault, and no rival.
+        # A fault that explains something in addition to the best one is a second fault, not a rival.
         rivals[best] = tuple(
             name
             for name in others
             if name != best
-            and left[name] - left[best] < _LEAST_APART
-            and left[best] - measured.left([*found, best, name]) < _LEAST_GAIN
+            and left[name] - left[best] < _MIN_DIFFERENCE
+            and left[best] - measured.left([*found, best, name]) < _MIN_GAIN
         )
         found.append(best)

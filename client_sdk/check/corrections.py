@@ -1,4 +1,4 @@
-"""Apply to the intrinsics of a camera what a check found for certain."""
+"""Apply the corrections of certain findings to the intrinsics of a camera."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _LENS = ("k1", "k2", "p1", "p2", "k3")
 
 
 def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intrinsics, tuple[str, ...]]:
-    """Return intrinsics with the corrections of *findings*, and what was changed, for people.
+    """Return intrinsics with corrections of those *findings* that are certain, and a text on each change.
 
-    Distortion is corrected where there was none: that of a lens which is undistorted already would have to be
-    composed with what is left.
+    A correction of the distortion is applied only if *intrinsics* has none: the estimate describes what
+    remains after undistortion, which cannot be added to the coefficients of an existing model.
     """
     changed: list[str] = []
     camera, lens = intrinsics.camera, intrinsics.distortion
@@ -39,6 +39,6 @@ def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intr
             scale = intrinsics.depth_units_per_m / (1.0 + finding.value)
             changed.append(f"depth_scale {intrinsics.depth_units_per_m:.6g} to {scale:.6g}")
     made = Camera(**values, width=camera.width, height=camera.height)
-    # What the calibration said of its error is not true of other numbers.
+    # The reprojection error and the number of views of the old calibration do not describe the new one.
     same = replace(intrinsics, rms_px=None, views=None) if changed else intrinsics
     return replace(same, camera=made, distortion=lens, depth_scale=scale), tuple(changed)

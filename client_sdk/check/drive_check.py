@@ -1,4 +1,7 @@
-"""The check of a drive beside what makes a map of it: it costs little, and never fails that."""
+"""Check a drive while a map is made of it; an error of the check never stops the map.
+
+Also formats the result of a check as lines of text.
+"""
 
 from __future__ import annotations
 
@@ -19,38 +22,49 @@ __all__ = ["DriveCheck", "check_lines"]
 _T = TypeVar("_T")
 
 
-def check_lines(told: Mapping[str, Any], *, is_whole: bool = False, shown: Collection[str] = ()) -> list[str]:
-    """Return a report for people: each finding with its fix.
+def check_lines(
+    report: Mapping[str, Any], *, is_whole: bool = False, shown: Collection[str] = ()
+) -> list[str]:
+    """Return the lines of text that show the result of a check: one for each finding, with its fix.
 
-    *is_whole* adds cost and what cannot be told; doubts whose lines were *shown* before are left out.
+    Args:
+        report: The result, as `CheckReport.to_dict` returns it.
+        is_whole: Whether to add the faults that the drive cannot show, with reasons, and the notes.
+        shown: Lines of doubts about the source that were printed before; they are left out.
     """
-    findings: Sequence[Mapping[str, Any]] = told.get("findings") or []
-    untold: Sequence[Mapping[str, Any]] = told.get("cannot_tell") or []
+    findings: Sequence[Mapping[str, Any]] = report.get("findings") or []
+    undetermined: Sequence[Mapping[str, Any]] = report.get("cannot_tell") or []
     lines = []
     for each in findings:
         cost = each.get("cost")
         bends = "" if cost is None else f"; it bends the path by about {100 * cost:.1f} cm"
         lines.append(f"check: {each.get('sentence')}{bends}; {each.get('fix')}")
-    kinds = sorted({str(each.get("kind")) for each in untold})
-    doubts: Sequence[Mapping[str, Any]] = told.get("source") or []
+    kinds = sorted({str(each.get("kind")) for each in undetermined})
+    doubts: Sequence[Mapping[str, Any]] = report.get("source") or []
     lines += [line for each in doubts if (line := doubt_line(each)) not in shown]
     if doubts:
         lines.append(
             "check: no advice on the calibration while the source has a finding that is not accepted"
         )
-    elif told.get("poses") == 0:
-        lines.append(f"check: none of {told.get('frames')} frames got a pose: the calibration is not checked")
+    elif report.get("poses") == 0:
+        lines.append(
+            f"check: none of {report.get('frames')} frames got a pose: the calibration is not checked"
+        )
     elif not findings:
         vague = "" if is_whole or not kinds else f"; this drive cannot tell {', '.join(kinds)}"
-        lines.append(f"check: nothing wrong found in {told.get('frames')} frames{vague}")
+        lines.append(f"check: nothing wrong found in {report.get('frames')} frames{vague}")
     if is_whole:
-        lines += [f"cannot tell {each.get('kind')}: {each.get('reason')}" for each in untold]
-        lines += [f"note: {each}" for each in told.get("notes") or []]
+        lines += [f"cannot tell {each.get('kind')}: {each.get('reason')}" for each in undetermined]
+        lines += [f"note: {each}" for each in report.get("notes") or []]
     return lines
 
 
 class DriveCheck:
-    """A `DriveObserver` whose errors end the check and nothing else."""
+    """Run a `DriveObserver` while a map is made.
+
+    The first exception that the observer raises stops the check; it is kept as a line of text, and is not
+    raised.
+    """
 
     def __init__(self, *, is_wanted: bool, is_thinned: bool = False) -> None:
         self._observer: DriveObserver | None = None
@@ -60,17 +74,20 @@ class DriveCheck:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether it goes on: it is wanted, and had no error."""
+        """Whether the check still runs: it was wanted, and no error has stopped it."""
         return self._observer is not None
 
     def add(self, frame: Frame, tracked: TrackedFrame) -> None:
-        """Look at the next frame."""
+        """Pass the next frame and the result of tracking it to the observer, if the check still runs."""
         observer = self._observer
         if observer is not None:
             self._tried(lambda: observer.add(frame, tracked))
 
     def cause_of_loss(self) -> str | None:
-        """Return why most lost frames have no pose, if their images show it and are checked."""
+        """Return why most frames without a pose were lost, and what to do.
+
+        None if their images do not show the cause, or if the check does not run.
+        """
         observer = self._observer
         return None if observer is None else self._tried(observer.cause_of_loss)
 
@@ -81,10 +98,15 @@ class DriveCheck:
         doubts: Sequence[Doubt] = (),
         accepted: Iterable[str] = (),
     ) -> dict[str, Any] | None:
-        """Return what ``report.json`` holds of the check; None if it was not wanted.
+        """Check the whole drive, and return the result as ``report.json`` stores it.
 
-        *offsets* are what `Mapper.adjust_pairs` found in a stereo drive; *doubts* about the source are not
-        among the names that the user has *accepted*.
+        A check that an error stopped returns ``{"failed": message}``, and one that was not wanted None.
+
+        Args:
+            reference: The path that the motion of the camera is compared with.
+            offsets: The results of `Mapper.adjust_pairs` by number of the segment, for a stereo drive.
+            doubts: Doubts about the source that the user has not accepted.
+            accepted: Names of doubts that the user has accepted.
         """
         observer = self._observer
         if observer is not None:
@@ -96,15 +118,18 @@ class DriveCheck:
         return {"failed": self._failed} if self._failed else None
 
     @staticmethod
-    def lines(told: Mapping[str, Any] | None, shown: Collection[str] = ()) -> list[str]:
-        """Return the short form of what `finish` returned, without doubts that were *shown* before."""
-        if told is None:
+    def lines(report: Mapping[str, Any] | None, shown: Collection[str] = ()) -> list[str]:
+        """Return short lines of text for *report*, the result of `finish`; no line if it is None.
+
+        Doubts whose lines were *shown* before are left out.
+        """
+        if report is None:
             return []
-        failed = told.get("failed")
+        failed = report.get("failed")
         return (
             [f"check: it failed ({failed}); --no-check leaves it out"]
             if failed
-            else check_lines(told, shown=shown)
+            else check_lines(report, shown=shown)
         )
 
     def _tried(self, work: Callable[[], _T]) -> _T | None:
@@ -117,7 +142,7 @@ class DriveCheck:
 
 
 def _observer(*, is_thinned: bool) -> DriveObserver:
-    # What a check needs is imported where one is wanted.
+    # The observer imports much, so it is imported only if a check is wanted.
     from client_sdk.check.observer import DriveObserver
 
     return DriveObserver(is_thinned=is_thinned)

@@ -1,4 +1,7 @@
-"""Turn the keyframes of a drive into observations and first poses, under one reading of its depth images."""
+"""Prepare the keyframes of a drive for bundle adjustment: observations, initial poses and landmarks.
+
+Depth images may be flipped, or later than the colour images: each such `DepthReading` is tried.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +21,40 @@ __all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model", "nearest
 
 Rows = npt.NDArray[np.int64]
 
-_LEAST_SEEN, _LEAST_KEYFRAMES = 20, 5
+_MIN_LANDMARKS = 20  # fewest known landmarks for the pose of a keyframe, and fewest landmarks of a drive
+_MIN_KEYFRAMES = 5  # fewest connected keyframes that are adjusted
 _PNP = PnpOptions(inlier_px=8.0, max_iterations=100)
-"""Wide: intrinsics that are wrong have residuals of some pixels."""
-_PIXEL_PX = 0.7
-_LEAST_SHARE = 0.3
-_FAR_S = 0.07
-_FASTEST_M_S, _REACHES_S = 3.0, (0.3, 0.2, 0.1)
-_ZOOMS = (1.25, 0.8)
-_MISS = 6.0
-"""What an observation costs in a frame whose pose could not be found."""
-_SCORE_PX, _SCORE_DEVIATIONS = 3.0, 4.0
-_DELAYS_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
-_BETTER = 0.9
-"""Another reading of the depth images is believed if it costs less than this share of the plain one."""
+"""Options of PnP for the initial poses.  The inlier threshold is wide, since wrong intrinsics cause residuals
+of some pixels."""
+_PIXEL_SIGMA_PX = 0.7  # standard deviation of the pixel of a feature of size 1
+_MIN_INLIER_SHARE = 0.3  # smallest share of inliers of an initial pose
+# Largest difference, seconds, between the stamp of a depth image and the time at which a depth is wanted.
+_MAX_STAMP_DIFFERENCE_S = 0.07
+# Largest rate of a depth, m/s; faster changes are an edge of an object, and count as a rate of 0.
+_MAX_RATE_M_S = 3.0
+_RATE_WINDOWS_S = (0.3, 0.2, 0.1)
+"""Times, in seconds before and after a depth image, between whose depths a rate is computed.  The first one
+with depths at both of its ends is used."""
+# Factors on the focal length that are tried if no pose is found: the frame may be of another camera.
+_FOCAL_LENGTH_FACTORS = (1.25, 0.8)
+_MAX_COST = 6.0
+"""Largest cost of one observation in the score of a reading, and the cost of each observation of a keyframe
+whose pose was not found.  Costs have no unit."""
+_SCORE_SCALE_PX = 3.0  # reprojection error, pixels, that counts as 1 before the logarithm of the score
+_SCORE_SCALE_SIGMAS = 4.0  # error of a depth, in standard deviations, that counts as 1
+_DELAYS_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)  # delays of the depth images that are tried
+_MAX_COST_RATIO = 0.9
+"""A flip or a delay of the depth images is accepted if its score is below this share of the score of the
+depth images as they are."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthReading:
-    """How depth images belong to colour images: the row of one of `FLIPS`, and so many seconds late."""
+    """How depth images belong to colour images.
+
+    ``flip`` is an index of `FLIPS`.  ``delay_s`` is the delay of the depth images in seconds: the depth image
+    with the stamp ``t + delay_s`` belongs to the colour image with the stamp ``t``.
+    """
 
     flip: int = 0
     delay_s: float = 0.0
@@ -44,9 +62,12 @@ class DepthReading:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DriveModel:
-    """The longest connected part of a drive: ``rows`` of its keyframes, where it begins, what they see.
+    """The longest connected part of a drive, with the poses and landmarks with which an adjustment begins.
 
-    ``score`` says how badly depths and pixels of the whole drive agree, before anything is adjusted.
+    ``rows`` ``(k,)`` are the indices of its keyframes among those of the drive; ``T_camera_world``
+    ``(k, 4, 4)`` their poses, and ``points_world`` ``(l, 3)`` the landmarks, both in metres.  ``score`` is
+    the mean cost of the observations of the whole drive before adjustment, see `_chain_poses`; NaN for poses
+    that do not come from depths.
     """
 
     rows: Rows
@@ -57,10 +78,13 @@ class DriveModel:
 
 
 def best_reading(keyframes: list[Keyframe], tracks: Tracks) -> DepthReading:
-    """Return how the depth images are read best: which way round, and how late."""
+    """Return the flip or the delay of the depth images with the lowest score.
+
+    That is the plain reading (no flip, no delay) unless another one has less than 0.9 times its score.
+    """
     readings = [DepthReading(flip) for flip in range(1, len(FLIPS))]
     readings += [DepthReading(delay_s=delay_s) for delay_s in _DELAYS_S]
-    best, least = DepthReading(), _BETTER * _score(keyframes, tracks, DepthReading())
+    best, least = DepthReading(), _MAX_COST_RATIO * _score(keyframes, tracks, DepthReading())
     for reading in readings:
         score = _score(keyframes, tracks, reading)
         if score < least:
@@ -69,7 +93,11 @@ def best_reading(keyframes: list[Keyframe], tracks: Tracks) -> DepthReading:
 
 
 def nearest_delay(keyframes: list[Keyframe], delay_s: float) -> float:
-    """Return the delay nearest to one at which there are depth images: a multiple of their interval."""
+    """Round a delay to a multiple of the interval of the depth images, seconds.
+
+    The result is bounded by the times before and after keyframes for which depth images were kept; it is 0
+    without such images.
+    """
     steps_s = [
         abs(apart_s) for keyframe in keyframes for apart_s, _ in keyframe.around if abs(apart_s) > 1e-3
     ]
@@ -84,22 +112,24 @@ def nearest_delay(keyframes: list[Keyframe], delay_s: float) -> float:
 def drive_model(
     keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading, *, by_depth: bool = True
 ) -> DriveModel | None:
-    """Return observations of a drive with poses to begin with; None where too few keyframes connect.
+    """Return the observations of a drive with initial poses and landmarks.
+
+    None if fewer than 5 keyframes connect, or if fewer than 20 landmarks are seen by two of them.
 
     Args:
-        keyframes: Of the drive.
-        tracks: Their landmarks.
-        reading: How their depths are read.
-        by_depth: Whether poses come from depths, or are those that were tracked.
+        keyframes: The keyframes of the drive, in the order of time.
+        tracks: Which of their features show the same landmark.
+        reading: Flip and delay of the depth images.
+        by_depth: Whether the initial poses come from PnP with depths; else they are the tracked ones.
     """
     camera = keyframes[0].camera
-    at, depths, rates = _gathered(keyframes, tracks, reading)
+    at, depths, rates = _gather_depths(keyframes, tracks, reading)
     pixels = np.concatenate([each.pixels for each in keyframes])[at]
     sizes = np.concatenate([each.sizes for each in keyframes])[at]
     variances = np.concatenate([_variances(each, reading) for each in keyframes])[at]
     score = np.nan
     if by_depth:
-        poses, score = _chained(camera, tracks, pixels, depths, np.sqrt(variances), len(keyframes))
+        poses, score = _chain_poses(camera, tracks, pixels, depths, np.sqrt(variances), len(keyframes))
     else:
         poses = np.array(
             [
@@ -108,18 +138,18 @@ def drive_model(
             ]
         )
     rows = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
-    if len(rows) < _LEAST_KEYFRAMES:
+    if len(rows) < _MIN_KEYFRAMES:
         return None
     renumbered = np.full(len(keyframes), -1)
     renumbered[rows] = np.arange(len(rows))
     kept = renumbered[tracks.keyframes] >= 0
     kept &= np.bincount(tracks.landmarks[kept], minlength=tracks.count)[tracks.landmarks] >= 2
     seen, landmarks = np.unique(tracks.landmarks[kept], return_inverse=True)
-    if len(seen) < _LEAST_SEEN:
+    if len(seen) < _MIN_LANDMARKS:
         return None
     observed = DriveObservations(
         camera=camera, keyframes=renumbered[tracks.keyframes[kept]], landmarks=landmarks,
-        pixels=pixels[kept], pixel_deviations_px=_PIXEL_PX * sizes[kept], depths_m=depths[kept],
+        pixels=pixels[kept], pixel_deviations_px=_PIXEL_SIGMA_PX * sizes[kept], depths_m=depths[kept],
         depth_deviations_m=np.sqrt(variances[kept]), rates_m_s=rates[kept],
         twists_s=np.array([keyframes[row].twist_s for row in rows]),
     )  # fmt: skip
@@ -130,14 +160,19 @@ def drive_model(
 
 
 def _score(keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading) -> float:
-    at, depths, _ = _gathered(keyframes, tracks, reading)
+    at, depths, _ = _gather_depths(keyframes, tracks, reading)
     pixels = np.concatenate([each.pixels for each in keyframes])[at]
     variances = np.concatenate([_variances(each, reading) for each in keyframes])[at]
-    return _chained(keyframes[0].camera, tracks, pixels, depths, np.sqrt(variances), len(keyframes))[1]
+    return _chain_poses(keyframes[0].camera, tracks, pixels, depths, np.sqrt(variances), len(keyframes))[1]
 
 
-def _gathered(keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading) -> tuple[Rows, Array, Array]:
-    """Return the rows of the tracks' features among those of all keyframes, their depths and rates."""
+def _gather_depths(
+    keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading
+) -> tuple[Rows, Array, Array]:
+    """Return ``(n,)`` each, for the features of the tracks: index, depth in metres, and rate in m/s.
+
+    The index counts the features of all keyframes, one keyframe after another.
+    """
     read = [_read_depths(keyframe, reading) for keyframe in keyframes]
     starts = np.concatenate([[0], np.cumsum([len(each.pixels) for each in keyframes])])
     at = starts[tracks.keyframes] + tracks.features
@@ -150,40 +185,50 @@ def _variances(keyframe: Keyframe, reading: DepthReading) -> Array:
 
 
 def _read_depths(keyframe: Keyframe, reading: DepthReading) -> tuple[Array, Array]:
-    """Return ``(n,)`` depths at the features, NaN where there are none, and ``(n,)`` their rates, m/s."""
+    """Return the depths ``(n,)`` at the features of a keyframe, m, and their change with time ``(n,)``, m/s.
+
+    A depth is NaN if there is no valid one, or no depth image near the time that *reading* states.
+    """
     n = len(keyframe.pixels)
     if reading.flip or len(keyframe.around) < 2:
         return keyframe.depths_m[reading.flip], np.zeros(n)
     around = sorted(keyframe.around, key=lambda each: each[0])
     apart_s = np.array([each[0] for each in around])
     at = int(np.argmin(np.abs(apart_s - reading.delay_s)))
-    if abs(apart_s[at] - reading.delay_s) > _FAR_S:
+    if abs(apart_s[at] - reading.delay_s) > _MAX_STAMP_DIFFERENCE_S:
         return np.full(n, np.nan), np.zeros(n)
     now = around[at]
     rates = np.full(n, np.nan)
-    # Far images first: the noise of a rate from near ones would pull the delay towards none.
-    for reach_s in _REACHES_S:
-        before, after = (around[row] for row in _ends(apart_s, at, reach_s))
+    # Wide windows first: rates from a short time are noisy, which would bias the estimated delay towards 0.
+    for reach_s in _RATE_WINDOWS_S:
+        before, after = (around[row] for row in _window_ends(apart_s, at, reach_s))
         if after[0] > before[0]:
             rates = np.where(np.isfinite(rates), rates, (after[1] - before[1]) / (after[0] - before[0]))
-    rates = np.where(np.abs(rates) < _FASTEST_M_S, rates, 0.0)
-    # A depth between two images is that of the nearest one, moved on: a mean of both would have less noise
-    # than either, and attract the delay.
+    rates = np.where(np.abs(rates) < _MAX_RATE_M_S, rates, 0.0)
+    # Extrapolate from the nearest depth image.  An interpolation between two images would have less noise
+    # than each of them, and so bias the estimated delay towards the middle between images.
     return now[1] + rates * (reading.delay_s - now[0]), rates
 
 
-def _ends(apart_s: Array, at: int, reach_s: float) -> tuple[int, int]:
-    """Return the first and the last row within a time of row *at*; of ascending times."""
+def _window_ends(apart_s: Array, at: int, reach_s: float) -> tuple[int, int]:
+    """Return the indices of the first and the last time within *reach_s* seconds of the time at index *at*.
+
+    *apart_s* ``(n,)`` are times in ascending order.
+    """
     low = int(np.searchsorted(apart_s, apart_s[at] - reach_s - 1e-3))
     return low, int(np.searchsorted(apart_s, apart_s[at] + reach_s + 1e-3)) - 1
 
 
-def _chained(
+def _chain_poses(
     camera: Camera, tracks: Tracks, pixels: Array, depths: Array, depths_dev_m: Array, count: int
 ) -> tuple[Array, float]:
-    """Return poses of the longest run of keyframes that connect, NaN elsewhere, and a score.
+    """Locate each keyframe by PnP with landmarks from the depths of those before it.
 
-    The score is the mean cost of landmarks where they are expected, in pixels and depth.
+    Returns ``T_camera_world`` ``(count, 4, 4)`` of the longest run of keyframes that connect, NaN for other
+    keyframes, and the score: the mean cost of an observation, which grows with the logarithm of its squared
+    errors in pixel and depth, and has no unit.
+
+    *pixels*, *depths* (m) and *depths_dev_m* (standard deviations, m) are those of the features of *tracks*.
     """
     poses, part = np.full((count, 4, 4), np.nan), np.zeros(count, dtype=np.int64)
     known = np.full((tracks.count, 3), np.nan)
@@ -194,40 +239,41 @@ def _chained(
         landmarks, at, depth = tracks.landmarks[own], pixels[own], depths[own]
         there = np.flatnonzero(np.isfinite(known[landmarks, 0]))
         T = _pose(camera, known[landmarks[there]], at[there])
-        for zoom in _ZOOMS if T is None and len(there) >= _LEAST_SEEN else ():
-            # A frame of another camera connects to those before with its own focal length only.
+        for zoom in _FOCAL_LENGTH_FACTORS if T is None and len(there) >= _MIN_LANDMARKS else ():
+            # A frame of another camera connects to earlier ones only with the focal length of that camera.
             own_camera = msgspec.structs.replace(camera, fx=zoom * camera.fx, fy=zoom * camera.fy)
             T = T if T is not None else _pose(own_camera, known[landmarks[there]], at[there])
         if T is not None:
             seen = transform(T, known[landmarks[there]])
             z = np.maximum(seen[:, 2], 0.05)
             seen[:, 2] = z
-            apart = np.square(camera.project(seen) - at[there]).sum(axis=1) / _SCORE_PX**2
-            deep = np.square((z - depth[there]) / (_SCORE_DEVIATIONS * depths_dev_m[own][there]))
+            apart = np.square(camera.project(seen) - at[there]).sum(axis=1) / _SCORE_SCALE_PX**2
+            deep = np.square((z - depth[there]) / (_SCORE_SCALE_SIGMAS * depths_dev_m[own][there]))
             cost = np.log1p(np.minimum(apart, 1e4)) + np.log1p(np.minimum(np.nan_to_num(deep, nan=1.0), 1e4))
-            total += float(np.minimum(cost, _MISS).sum())
+            total += float(np.minimum(cost, _MAX_COST).sum())
         elif row > 0:
-            total += _MISS * max(len(there), _LEAST_SEEN)
+            total += _MAX_COST * max(len(there), _MIN_LANDMARKS)
         if row > 0:
-            counted += max(len(there), _LEAST_SEEN if T is None else 0)
+            counted += max(len(there), _MIN_LANDMARKS if T is None else 0)
         if T is None:
             number += 1
             known[:] = np.nan
             T = np.eye(4)
         poses[row], part[row] = T, number
         fresh = np.isfinite(depth)
-        # A landmark is where it was seen last: an error of one depth does not stay.
+        # The newest depth of a landmark replaces its position, so that an error of one depth does not
+        # persist.
         known[landmarks[fresh]] = transform(inverse(T), camera.back_project(at[fresh], depth[fresh]))
     poses[part != np.bincount(part).argmax()] = np.nan
     return poses, total / max(counted, 1)
 
 
 def _pose(camera: Camera, points: Array, pixels: Array) -> Array | None:
-    if len(points) < _LEAST_SEEN:
+    if len(points) < _MIN_LANDMARKS:
         return None
     try:
         found = solve_pnp(points, pixels, camera, _PNP)
     except PnpError:
         return None
-    enough = max(_LEAST_SEEN // 2, _LEAST_SHARE * len(points))
+    enough = max(_MIN_LANDMARKS // 2, _MIN_INLIER_SHARE * len(points))
     return found.T_camera_world if len(found.inliers) >= enough else None

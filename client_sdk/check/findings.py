@@ -1,4 +1,4 @@
-"""What is wrong with a drive, worst first, and what the drive cannot tell."""
+"""Values for the result of a check: faults of a drive, and faults that the drive cannot show."""
 
 from __future__ import annotations
 
@@ -13,22 +13,30 @@ from rse_pf.errors import UsageError
 
 __all__ = ["CannotTell", "CheckReport", "FaultKind", "Finding", "matters", "order"]
 
-_DEVIATIONS = 3.0
-"""A finding is larger than so many of its deviations."""
-_LEAST_COST_M, _COST_OF_NOISE = 0.002, 1.2
+_CERTAIN_SIGMAS = 3.0  # a finding is certain if its value exceeds this many of its standard deviations
+_MIN_COST_M = 0.002  # a fault matters only if it bends the path by more than this, in metres
+_MIN_COST_NOISES = 1.2  # and by more than this many times the uncertainty of the path
 
 
 class FaultKind(str, Enum):
-    """What can be wrong with a drive, and what the value of a finding of that kind is.
+    """Kinds of faults of a drive, as reports name them.
 
-    Of ``focal_length``, ``depth_scale`` and ``baseline`` the relative error of the setting; of
-    ``principal_point`` its error, px, the larger of both.  ``distortion`` is the ``k1`` that the images still
-    have.  ``depth_offset`` says by how many metres depths are too large; ``depth_delay`` by how many seconds
-    the depth of a frame is older than its colours; ``stamp_delay`` by how many seconds the stamps of images
-    are later than those of odometry, truth or IMU; ``disparity_offset`` by how many pixels disparities are
-    too small.  ``blur``, ``dark``, ``repeated`` and ``missing`` are
-    shares of the frames; ``jitter`` is the deviation of the interval, relative.  ``two_cameras`` and
-    ``moving_focal_length`` are by how much focal lengths differ, relative.  Others are 1.
+    The kind determines the meaning of `Finding.value`:
+
+    - ``focal_length``, ``depth_scale``, ``baseline``: relative error of the setting
+    - ``principal_point``: error of cx or cy, whichever is larger in its standard deviations, px
+    - ``distortion``: coefficient ``k1`` of the distortion that the images still have
+    - ``depth_offset``: metres by which depths are too large
+    - ``depth_delay``: seconds by which the depth of a frame is older than its colour image
+    - ``stamp_delay``: seconds by which the stamps of the images are later than those of odometry, ground
+      truth or IMU
+    - ``disparity_offset``: pixels by which disparities are too small
+    - ``blur``, ``dark``, ``repeated``, ``missing``: share of the frames, 0..1
+    - ``jitter``: standard deviation of the interval between frames, relative to the interval
+    - ``two_cameras``, ``moving_focal_length``: relative difference of the focal lengths
+    - ``mirrored``, ``swapped_axes``: 1
+    - ``swapped_cameras``, and a ``baseline`` or ``stamp_delay`` that was found by comparing the two images of
+      stereo pairs: the value of `client_sdk.rigs.stereo_pair_checks.PairFault`
     """
 
     FOCAL_LENGTH = "focal_length"
@@ -52,10 +60,10 @@ class FaultKind(str, Enum):
     MOVING_FOCAL_LENGTH = "moving_focal_length"
 
 
-_FIRST = (
+_DOMINANT_KINDS = (
     FaultKind.SWAPPED_CAMERAS, FaultKind.MIRRORED, FaultKind.SWAPPED_AXES, FaultKind.TWO_CAMERAS,
 )  # fmt: skip
-"""While one of these is there, what else is measured describes it, and not a fault of its own."""
+"""Faults that are listed first: while a drive has one of them, other findings may be its consequences."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,13 +72,13 @@ class Finding:
 
     Attributes:
         kind: What is wrong.
-        value: By how much, in *unit*.  Of a setting it is the relative error: +0.1 means that it is 10 % too
-            large, 4.0 that it is five times what it should be.  Of a share it is within 0..1.
-        deviation: Standard deviation of *value*, in *unit*; 0 of what is counted.
+        value: Size of the fault in *unit*, see `FaultKind`.  For a relative error, +0.1 means that a setting
+            is 10 % too large, and 4.0 that it is five times what it should be.
+        deviation: Standard deviation of *value*, in *unit*; 0 if the value was counted or needs none.
         unit: ``relative``, ``share``, ``px``, ``m``, ``s`` or empty.
-        cost_m: By how much it bends the trajectory, metres; None if unknown.
-        sentence: What is wrong, by how much, with the deviation.
-        fix: What to do.
+        cost_m: How far the fault bends the trajectory, metres; None if unknown.
+        sentence: What is wrong and by how much, with the deviation.
+        fix: What the user should do.
         correction: Keys of ``intrinsics.json`` and the numbers that they should have; empty if the fault is
             not in that file.  Distortion is ``k1``, ``k2``, ``p1``, ``p2``, ``k3``.
 
@@ -98,11 +106,11 @@ class Finding:
 
     @property
     def is_certain(self) -> bool:
-        """Whether it is larger than three of its deviations."""
-        return abs(self.value) > _DEVIATIONS * self.deviation
+        """Whether the absolute value exceeds three standard deviations."""
+        return abs(self.value) > _CERTAIN_SIGMAS * self.deviation
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a report holds of it; ``cost`` is in metres."""
+        """Return the finding as an object for a JSON report; its ``cost`` is in metres, None if unknown."""
         return {
             "kind": self.kind.value, "value": self.value, "deviation": self.deviation, "unit": self.unit,
             "cost": self.cost_m, "sentence": self.sentence, "fix": self.fix,
@@ -112,12 +120,13 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class CannotTell:
-    """A fault that this drive could have without showing it.
+    """A fault that a drive may have although the check cannot find it in this drive.
 
     Attributes:
-        kind: Of the fault.
-        reason: Why, such as "no turn about the vertical axis: focal length within 6 %".
-        within: The bound that the drive does give, in the unit of a finding of that kind; None without one.
+        kind: The kind of the fault.
+        reason: What the drive lacks, such as "no turn about the vertical axis: focal length within 6 %".
+        within: Bound of the absolute error that the drive does determine, in the unit of a finding of that
+            kind; None if there is no bound.
     """
 
     kind: FaultKind
@@ -125,21 +134,22 @@ class CannotTell:
     within: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the fault and the reason as an object for a JSON report."""
         return {"kind": self.kind.value, "reason": self.reason, "within": self.within}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport:
-    """What a check found in a drive.
+    """The result of checking a drive.
 
     Attributes:
-        findings: Worst first, see `order`.
-        cannot_tell: What the drive cannot show.
-        frames: So many were looked at.
-        poses: So many of them got a pose; None if unknown.
-        notes: Sentences on what was not looked at, and why.
-        doubts: What is unlikely about the source; while there is a doubt, nothing is advised.
+        findings: Faults of the drive, worst first, see `order`.
+        cannot_tell: Faults that the drive cannot show.
+        frames: Number of frames that were checked.
+        poses: Number of frames with a pose; None if unknown.
+        notes: Sentences on what was not checked, and why.
+        doubts: Unlikely facts about the source that the user has not accepted.  If there is one, the
+            calibration was not checked, and there are no findings.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -150,7 +160,7 @@ class CheckReport:
     doubts: tuple[Doubt, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``report.json`` holds."""
+        """Return the result as an object for ``report.json``; the doubts are its ``source``."""
         return {
             "frames": self.frames,
             "poses": self.poses,
@@ -162,34 +172,43 @@ class CheckReport:
 
 
 def matters(cost_m: float, noise_m: float) -> bool:
-    """Say whether a fault bends a path by more than the path is known: by its noise, and by 2 mm."""
-    return cost_m > max(_LEAST_COST_M, _COST_OF_NOISE * noise_m)
+    """Return whether a fault bends a path by more than 2 mm and more than 1.2 times its uncertainty.
+
+    Args:
+        cost_m: How far the fault bends the path, metres.
+        noise_m: Uncertainty of the path, root mean square, metres.
+    """
+    return cost_m > max(_MIN_COST_M, _MIN_COST_NOISES * noise_m)
 
 
 def order(findings: Iterable[Finding], noise_m: float = 0.0) -> tuple[Finding, ...]:
     """Return the findings that are certain and matter, worst first, one of each kind.
 
-    A finding whose cost is known to be below the noise of the drive does not matter.  Faults that change what
-    all others mean come first, then those that cost most, then those of unknown cost.  Of two findings of one
-    kind the one that is known better is kept.
+    A finding whose cost is known and at most *noise_m* is left out.  Faults whose consequences may appear as
+    other faults come first, then those with the largest cost, then those of unknown cost.  Of two findings of
+    one kind the one with the smaller relative deviation is kept.
 
     Args:
-        findings: In any order.
-        noise_m: How well this drive tells its trajectory, metres.
+        findings: Findings in any order.
+        noise_m: Uncertainty of the trajectory, root mean square, metres.
     """
     kept: dict[FaultKind, Finding] = {}
     for each in findings:
         matters = each.cost_m is None or each.cost_m > noise_m
         other = kept.get(each.kind)
-        if each.is_certain and matters and (other is None or _doubt(each) < _doubt(other)):
+        if (
+            each.is_certain
+            and matters
+            and (other is None or _relative_deviation(each) < _relative_deviation(other))
+        ):
             kept[each.kind] = each
-    return tuple(sorted(kept.values(), key=_place))
+    return tuple(sorted(kept.values(), key=_sort_key))
 
 
-def _doubt(finding: Finding) -> float:
+def _relative_deviation(finding: Finding) -> float:
     return finding.deviation / max(abs(finding.value), 1e-12)
 
 
-def _place(finding: Finding) -> tuple[int, float, float]:
-    rank = _FIRST.index(finding.kind) if finding.kind in _FIRST else len(_FIRST)
-    return rank, -(finding.cost_m or 0.0), _doubt(finding)
+def _sort_key(finding: Finding) -> tuple[int, float, float]:
+    rank = _DOMINANT_KINDS.index(finding.kind) if finding.kind in _DOMINANT_KINDS else len(_DOMINANT_KINDS)
+    return rank, -(finding.cost_m or 0.0), _relative_deviation(finding)

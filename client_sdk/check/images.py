@@ -1,4 +1,4 @@
-"""What is wrong with the images of a drive: blurred, dark, repeated, missing, or at an uneven rate."""
+"""Find faults of the images of a drive: blurred, dark, repeated or missing frames, and an uneven rate."""
 
 from __future__ import annotations
 
@@ -23,28 +23,49 @@ _SHARPEN = "drive more slowly, shorten the exposure or add light, and focus the 
 _LIGHTEN = "add light, lengthen the exposure, or uncover the lens"
 _SHOW_TEXTURE = "point the camera at things with texture, not at a bare wall or the sky alone"
 
-_LINES, _THUMBNAIL = 60, 32
-"""So many rows and columns of an image are looked at, and pixels along a side are compared with the last."""
-_HALF_PX, _LEAST_STEP, _STRONGEST, _FEWEST_EDGES, _MOST_EDGES = 8, 16, 0.04, 40, 600
-_BLURRED, _OF_NEIGHBOURS, _NEIGHBOURS = 0.31, 0.6, 15
-_DARK_LEVEL = 40
-_FEWEST_FRAMES = 10
-_LEAST_SHARE = {FaultKind.BLUR: 0.3, FaultKind.DARK: 0.05, FaultKind.REPEATED: 0.05, FaultKind.MISSING: 0.05}
-_LEAST_FRAMES = 3
-_STILL, _LONGEST_RUN = 0.3, 10
-_FROZEN_JUMP = 1.7  # times the usual change; a camera that was at rest drives on with less
-_MOSTLY = 0.5  # of the lost frames have a cause in common
-_NEAR_WHOLE, _LEAST_JITTER, _LONGEST_GAP = 0.15, 0.15, 50.0
+_SAMPLED_LINES = 60  # about this many rows, and as many columns, are searched for edges: bounds the time
+_THUMBNAIL_PX = 32  # approximate side, in pixels, of the thumbnails with which successive images are compared
+_EDGE_HALF_WIDTH_PX = 8  # half of the distance, in pixels, over which the contrast of an edge is measured
+_MIN_EDGE_STEP = 16  # smallest contrast of an edge, in grey levels of 255: noise has less
+_EDGE_SHARE = 0.04  # share of the sampled pixels, those with the highest contrast, that count as edges
+_MIN_EDGES = 40  # fewest edges from which the sharpness of an image is measured
+_MAX_EDGES = 600  # largest number of edges of an image that are measured: bounds the time
+_MIN_SHARPNESS = 0.31  # below this `sharpness`, an edge is wider than about 7 px, and an image may be blurred
+# An image is blurred only if its sharpness is also below this share of that of its sharpest neighbours.
+_MIN_SHARPNESS_RATIO = 0.6
+_NEIGHBOURS = 15  # number of frames before, and after, a frame with which its sharpness is compared
+_MAX_DARK_LEVEL = 40  # an image is dark if 98 % of its pixels are below this grey level of 255
+_MIN_FRAMES = 10  # fewest frames, and fewest intervals, with which a drive is checked
+# Smallest share of faulty frames that is reported.
+_MIN_SHARES = {FaultKind.BLUR: 0.3, FaultKind.DARK: 0.05, FaultKind.REPEATED: 0.05, FaultKind.MISSING: 0.05}
+_MIN_FAULTY_FRAMES = 3  # smallest number of faulty frames, or of gaps, that is reported
+# A run of equal images is a fault if the next change is at least this share of the median change: after a
+# stationary camera, images change less.
+_MIN_CHANGE_RATIO = 0.3
+_MAX_REPEATED_RUN = 10  # largest number of repeated images in a row; a longer run may be a stationary camera
+# A longer run of equal images is a fault if the next change exceeds this many times the median change: a
+# camera that starts to move changes the image less.
+_MIN_FROZEN_JUMP = 1.7
+# A cause of loss is named only if more than this share of the lost frames are dark, plain or blurred.
+_MIN_COMMON_CAUSE_SHARE = 0.5
+# Largest distance of 90 % of the intervals from a multiple of the camera's interval, as a share of it.
+_MAX_INTERVAL_ERROR = 0.15
+# smallest standard deviation of the intervals, as a share of the interval, that is a fault
+_MIN_JITTER = 0.15
+_MAX_GAP_INTERVALS = 50.0  # a longer gap, in intervals of the camera, is a pause and not missing frames
 
 
 class FrameStatistics:
-    """Small figures of each frame, in the order of time, and what they say together.
+    """Collect sharpness, brightness, change and time stamp of each frame, and find faults in them.
 
-    An image takes about a millisecond; a dozen numbers of each are kept.
+    An image takes about a millisecond; five numbers of each image are kept, and a thumbnail of the last one.
     """
 
     def __init__(self, *, is_thinned: bool = False) -> None:
-        """Start without frames; of those that are thinned out on purpose, gaps and rate are not judged."""
+        """Start without frames.
+
+        *is_thinned* states that frames were left out on purpose: then neither gaps nor jitter are checked.
+        """
         self._is_thinned = is_thinned
         self._stamps_s: list[float] = []
         self._sharpness: list[tuple[float, float]] = []
@@ -56,9 +77,9 @@ class FrameStatistics:
         return len(self._stamps_s)
 
     def add(self, timestamp_s: float, rgb: _Image) -> None:
-        """Add the next image ``(h, w, 3)`` uint8."""
+        """Add the next image ``(h, w, 3)`` uint8 with its time stamp in seconds."""
         green = rgb[:, :, 1]
-        steps = [max(1, side // _THUMBNAIL) for side in green.shape]
+        steps = [max(1, side // _THUMBNAIL_PX) for side in green.shape]
         small = rgb[:: steps[0], :: steps[1]].astype(np.int16)
         last = self._last
         self._change.append(
@@ -70,29 +91,32 @@ class FrameStatistics:
         self._sharpness.append(sharpness(green))
 
     def findings(self) -> tuple[list[Finding], list[CannotTell]]:
-        """Return what is wrong with the images, and what cannot be told of them."""
-        if len(self) < _FEWEST_FRAMES:
-            reason = f"{len(self)} frames are too few to judge the images"
+        """Return the faults of the images and time stamps, and the faults that cannot be checked."""
+        if len(self) < _MIN_FRAMES:
+            reason = f"{len(self)} frames are too few to check the images"
             return [], [CannotTell(FaultKind.BLUR, reason)]
         found = [
-            self._share(
+            self._share_finding(
                 FaultKind.BLUR, self.blurred(), "blurred: their edges are wider than 7 px",
                 _SHARPEN,
             ),
-            self._share(
+            self._share_finding(
                 FaultKind.DARK, self.dark(), "dark: they show nothing",
                 _LIGHTEN,
             ),
-            self._share(
+            self._share_finding(
                 FaultKind.REPEATED, self.repeated(), "the image before once more, with a new time stamp",
                 "record at the rate of the camera, not above it, and look for a driver that repeats images",
             ),
         ]  # fmt: skip
-        timing, untold = self._timing()
-        return [*(each for each in found if each is not None), *timing], untold
+        timing, undetermined = self._check_timing()
+        return [*(each for each in found if each is not None), *timing], undetermined
 
     def blurred(self) -> npt.NDArray[np.bool_]:
-        """Return which frames ``(n,)`` are blurred: beside their neighbours, or all of the drive."""
+        """Return which frames ``(n,)`` are blurred: compared with their neighbours, or all of the drive.
+
+        A frame without edges is not blurred.
+        """
         values = np.array(self._sharpness).reshape(-1, 2)
         is_blurred = np.zeros(len(values), dtype=bool)
         for direction in values.T:
@@ -100,27 +124,30 @@ class FrameStatistics:
             for row in known:
                 near = direction[max(0, row - _NEIGHBOURS) : row + _NEIGHBOURS + 1]
                 sharp = float(np.percentile(near[np.isfinite(near)], 90))
-                # Where no neighbour is sharp either, texture and blur look alike: see below.
-                is_blurred[row] |= direction[row] < min(_BLURRED, _OF_NEIGHBOURS * sharp)
+                # If no neighbour is sharp either, the scene may lack texture: the whole drive decides below.
+                is_blurred[row] |= direction[row] < min(_MIN_SHARPNESS, _MIN_SHARPNESS_RATIO * sharp)
         best = values[np.isfinite(values).any(axis=1)]
-        if len(best) >= _FEWEST_FRAMES and np.percentile(np.nanmax(best, axis=1), 90) < _BLURRED:
+        if len(best) >= _MIN_FRAMES and np.percentile(np.nanmax(best, axis=1), 90) < _MIN_SHARPNESS:
             is_blurred[np.isfinite(values).any(axis=1)] = True
         return is_blurred
 
     def dark(self) -> npt.NDArray[np.bool_]:
-        """Return which frames ``(n,)`` are too dark to show anything."""
-        return np.array(self._bright) < _DARK_LEVEL
+        """Return which frames ``(n,)`` are dark: 98 % of their pixels are below grey level 40 of 255."""
+        return np.array(self._bright) < _MAX_DARK_LEVEL
 
     def empty(self) -> npt.NDArray[np.bool_]:
-        """Return which frames ``(n,)`` show no edge at all: a plain wall, or nothing."""
+        """Return which frames ``(n,)`` have too few edges to measure sharpness, such as a plain wall."""
         empty: npt.NDArray[np.bool_] = np.isnan(np.array(self._sharpness).reshape(-1, 2)).all(axis=1)
         return empty
 
     def cause_of_loss(self, is_lost: npt.NDArray[np.bool_]) -> str | None:
-        """Return what most of the lost frames ``(n,)`` lack and what to do; None if they show enough.
+        """Return the most frequent cause for which frames were lost, with an action, as one sentence.
 
-        A dark image has no edges either, and a strong blur leaves few, so that darkness counts first, and the
-        most frequent cause is named.
+        A lost frame counts as dark, else as plain (too few edges), else as blurred.  None if no more than
+        half of the lost frames have one of these causes.
+
+        Args:
+            is_lost: ``(n,)``, which frames have no pose.
         """
         is_dark = self.dark()
         is_plain = self.empty() & ~is_dark
@@ -130,36 +157,42 @@ class FrameStatistics:
         )  # fmt: skip
         counts = [int(np.count_nonzero(rows & is_lost)) for rows, *_ in causes]
         total = int(np.count_nonzero(is_lost))
-        if sum(counts) <= _MOSTLY * total:
+        if sum(counts) <= _MIN_COMMON_CAUSE_SHARE * total:
             return None
         _, what, fix = causes[int(np.argmax(counts))]
         return f"{max(counts)} of {total} frames without a pose {what}: {fix}"
 
     def repeated(self) -> npt.NDArray[np.bool_]:
-        """Return which frames ``(n,)`` have the image of the frame before, while the camera moves."""
+        """Return which frames ``(n,)`` repeat the image of the frame before although the camera moves.
+
+        Only runs of at most 10 repeated images count; `frozen` finds longer ones.
+        """
         change = np.array(self._change)
         moving = change[(change > 0.0) & np.isfinite(change)]
         is_repeated: npt.NDArray[np.bool_] = np.zeros(len(change), dtype=bool)
-        least = _STILL * float(np.median(moving)) if len(moving) else math.inf
+        least = _MIN_CHANGE_RATIO * float(np.median(moving)) if len(moving) else math.inf
         end = len(change)
         for row in range(len(change) - 1, -1, -1):
             if change[row] == 0.0:
                 continue
-            # A camera that stands still gives equal images for long, or moves little after them.
+            # A stationary camera gives longer runs of equal images, or moves little after them.
             after = change[end] if end < len(change) else math.inf
-            is_repeated[row + 1 : end] = end - row - 1 <= _LONGEST_RUN and after >= least
+            is_repeated[row + 1 : end] = end - row - 1 <= _MAX_REPEATED_RUN and after >= least
             end = row
         return is_repeated
 
     def frozen(self) -> tuple[Doubt, ...]:
-        """Return a doubt about runs of one image that are longer than `repeated` takes, and end in a jump."""
+        """Return a doubt if more than 10 images in a row repeat one image and the next one differs strongly.
+
+        The doubt names the longest such run; the result is empty without one.
+        """
         change = np.array(self._change)
         moving = change[(change > 0.0) & np.isfinite(change)]
         ends = np.flatnonzero(change != 0.0)
         runs = [
             (last, end - last - 1)
             for last, end in itertools.pairwise(ends)
-            if end - last - 1 > _LONGEST_RUN and change[end] > _FROZEN_JUMP * np.median(moving)
+            if end - last - 1 > _MAX_REPEATED_RUN and change[end] > _MIN_FROZEN_JUMP * np.median(moving)
         ]
         if not runs:
             return ()
@@ -171,12 +204,14 @@ class FrameStatistics:
         hint = "look for a driver or a recorder that repeats its last image"
         return (Doubt(name=DoubtName.FROZEN_IMAGES, sentence=sentence, hint=hint),)
 
-    def _share(self, kind: FaultKind, rows: npt.NDArray[np.bool_], what: str, fix: str) -> Finding | None:
+    def _share_finding(
+        self, kind: FaultKind, rows: npt.NDArray[np.bool_], what: str, fix: str
+    ) -> Finding | None:
         n, count = len(rows), int(rows.sum())
         share = count / n
-        if share < _LEAST_SHARE[kind] or count < _LEAST_FRAMES:
+        if share < _MIN_SHARES[kind] or count < _MIN_FAULTY_FRAMES:
             return None
-        # What is dark or repeated is counted; whether an image is blurred is measured.
+        # Dark and repeated frames are counted exactly; blur is measured, so its share has a binomial error.
         deviation = math.sqrt(share * (1.0 - share) / n) if kind is FaultKind.BLUR else 0.0
         doubt = f" +- {100 * deviation:.0f}" if deviation > 0.0 else ""
         return Finding(
@@ -184,27 +219,31 @@ class FrameStatistics:
             sentence=f"{count} of {n} frames ({100 * share:.0f}{doubt} %) are {what}", fix=fix,
         )  # fmt: skip
 
-    def _timing(self) -> tuple[list[Finding], list[CannotTell]]:
-        """Return gaps and jitter of the time stamps."""
+    def _check_timing(self) -> tuple[list[Finding], list[CannotTell]]:
+        """Return the findings on missing frames and jitter of the stamps, or why they were not checked."""
         if self._is_thinned:
             reason = "frames were left out on purpose: gaps and jitter are not those of the camera"
             return [], [CannotTell(FaultKind.MISSING, reason), CannotTell(FaultKind.JITTER, reason)]
         steps_s = np.diff(np.array(self._stamps_s))
         steps_s = steps_s[steps_s > 0.0]
-        if len(steps_s) < _FEWEST_FRAMES:
-            return [], [CannotTell(FaultKind.JITTER, f"{len(steps_s)} intervals tell no rate")]
+        if len(steps_s) < _MIN_FRAMES:
+            return [], [CannotTell(FaultKind.JITTER, f"{len(steps_s)} intervals do not determine a rate")]
         interval_s = _interval_s(steps_s)
         steps = steps_s / interval_s
         whole = np.maximum(1.0, np.round(steps))
-        lost = whole[whole <= _LONGEST_GAP] - 1.0
+        lost = whole[whole <= _MAX_GAP_INTERVALS] - 1.0
         findings: list[Finding] = []
         missing, n = int(lost.sum()), len(self)
         share = missing / (missing + n)
-        off = (steps - whole)[steps < _LONGEST_GAP]
+        off = (steps - whole)[steps < _MAX_GAP_INTERVALS]
         low, high = np.percentile(off, (5, 95))
         jitter = float(np.std(np.clip(off, low, high)))
-        is_even = jitter < _LEAST_JITTER
-        if share >= _LEAST_SHARE[FaultKind.MISSING] and np.count_nonzero(lost) >= _LEAST_FRAMES and is_even:
+        is_even = jitter < _MIN_JITTER
+        if (
+            share >= _MIN_SHARES[FaultKind.MISSING]
+            and np.count_nonzero(lost) >= _MIN_FAULTY_FRAMES
+            and is_even
+        ):
             findings.append(
                 Finding(
                     kind=FaultKind.MISSING, value=share, deviation=0.0, unit="share", cost_m=None,
@@ -227,7 +266,7 @@ class FrameStatistics:
 
 
 def _percentile(values: npt.NDArray[np.int16], percent: int) -> float:
-    """Return what `numpy.percentile` does of some numbers, in a fifth of its time."""
+    """Return a percentile of *values* as `numpy.percentile` interpolates it, in a fifth of its time."""
     ordered = np.sort(values, axis=None)
     row, rest = divmod(percent * (len(ordered) - 1), 100)
     low, high = float(ordered[row]), float(ordered[min(row + 1, len(ordered) - 1)])
@@ -235,30 +274,34 @@ def _percentile(values: npt.NDArray[np.int16], percent: int) -> float:
 
 
 def sharpness(gray: _Image) -> tuple[float, float]:
-    """Return how sharp the strongest edges of ``(h, w)`` uint8 are, along x and along y; NaN without edges.
+    """Return the sharpness of the strongest edges of an image ``(h, w)`` uint8, along x and along y.
 
-    It is the steepest difference over two pixels beside the whole step over 16: 1 for a step within two
-    pixels, and about ``2 / n`` for one that is blurred over *n*.  Texture changes it little.
+    The sharpness of an edge is its largest difference over two pixels, divided by its difference over 16
+    pixels: 1 for a step within two pixels, about ``2 / n`` for a step that is blurred over *n* pixels.  The
+    result is the median of the edges; NaN in a direction with fewer than 40 edges.
     """
-    rows, columns = (max(1, side // _LINES) for side in gray.shape)
+    rows, columns = (max(1, side // _SAMPLED_LINES) for side in gray.shape)
     # Copied row by row, as the image lies in memory, before its columns become lines.
     upright = np.ascontiguousarray(gray[:, ::columns]).T
     return _edges(np.ascontiguousarray(gray[::rows])), _edges(np.ascontiguousarray(upright))
 
 
 def _edges(lines: _Image) -> float:
-    """Return the sharpness along the rows of ``(n, w)`` uint8."""
-    if lines.shape[1] < 6 * _HALF_PX:
+    """Return the median sharpness of the edges along the rows of an image ``(n, w)`` uint8, see `sharpness`.
+
+    NaN if there are fewer than 40 edges, or if the rows are shorter than 48 pixels.
+    """
+    if lines.shape[1] < 6 * _EDGE_HALF_WIDTH_PX:
         return math.nan
-    strong = max(1, int(_STRONGEST * len(lines) * (lines.shape[1] - 2 * _HALF_PX)))
-    sharpest = np.empty(_MOST_EDGES)
+    strong = max(1, int(_EDGE_SHARE * len(lines) * (lines.shape[1] - 2 * _EDGE_HALF_WIDTH_PX)))
+    sharpest = np.empty(_MAX_EDGES)
     count = _core_edges()(
-        address_of(lines), *lines.shape, strong, _LEAST_STEP, _MOST_EDGES,
+        address_of(lines), *lines.shape, strong, _MIN_EDGE_STEP, _MAX_EDGES,
         address_of(sharpest),
     )  # fmt: skip
-    if count < _FEWEST_EDGES:
+    if count < _MIN_EDGES:
         return math.nan
-    every = -(-count // _MOST_EDGES)
+    every = -(-count // _MAX_EDGES)
     return float(np.median(sharpest[: -(-count // every)]))
 
 
@@ -269,11 +312,15 @@ def _core_edges() -> Any:
 
 
 def _interval_s(steps_s: Array) -> float:
-    """Return the interval of the camera: that of which all are multiples, else the median."""
+    """Return the interval between two frames of the camera, seconds, from the steps of its time stamps.
+
+    That is the percentile of *steps_s* ``(n,)`` (50, 35 or 20) of which 90 % of the steps are nearly
+    multiples; without one, the median.
+    """
     for percent in (50, 35, 20):
         interval_s = float(np.percentile(steps_s, percent))
         steps = steps_s / interval_s
         off = np.abs(steps - np.maximum(1.0, np.round(steps)))
-        if np.percentile(off, 90) < _NEAR_WHOLE:
+        if np.percentile(off, 90) < _MAX_INTERVAL_ERROR:
             return interval_s
     return float(np.median(steps_s))

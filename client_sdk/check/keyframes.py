@@ -1,7 +1,7 @@
-"""Keep of a drive what its calibration can be judged by: features of some frames, and depths around them.
+"""Collect the keyframes of a drive with which its calibration is checked, and match their features.
 
-Nothing is chosen by the calibration that is judged: frames by how far their features move in the image, and
-matches by an epipolar line, for which no calibration is needed.
+The selection does not use the calibration that is checked: keyframes are selected by the motion of their
+features in the image, and matches by a fundamental matrix, which needs no intrinsics.
 """
 
 from __future__ import annotations
@@ -28,29 +28,44 @@ __all__ = ["FLIPS", "Keyframe", "KeyframeStore", "Tracks", "tracks_of"]
 Rows = npt.NDArray[np.int64]
 
 FLIPS = ("as it is", "left and right swapped", "top and bottom swapped", "turned by half a turn")
-"""How the depth image may lie on the colour image."""
-_FEATURES, _MOST_FEATURES = 500, 1200
-_CANDIDATE_S = 0.19
-_MOVED_SHARE = 0.025
-"""Of the width of the image; a frame whose features moved less adds nothing."""
-_FEW = 60
-_MOST = 56
-_MOST_RAD_S = 3.0
-_AROUND_S = 0.42
-_SPREAD = 0.05
-_RATIO, _EPIPOLAR_PX = 0.8, 3.0
-_BACK = (1, 2, 3, 5, 8)
-_LEAST_MATCHES = 12
+"""Orientations of the depth image relative to the colour image that are tried, as messages name them."""
+_EXTRACTED_FEATURES = 500  # number of ORB features that are extracted if the tracker has none
+_MAX_FEATURES = 1200  # largest number of features of a keyframe, those of smallest scale: bounds the time
+_CANDIDATE_INTERVAL_S = 0.19  # shortest time, seconds, between two frames that are considered as keyframes
+_MIN_MOVED_SHARE = 0.025
+"""Smallest median motion of the features since the last keyframe, as a share of the image width, of a new
+keyframe.  It grows by a factor of 1.6 each time that half of the keyframes are removed."""
+# Fewest features of a keyframe; a frame with fewer matches to the last keyframe always becomes one.
+_MIN_FEATURES = 60
+_MAX_KEYFRAMES = 56  # above this number every second keyframe is removed: bounds memory and time
+_MAX_RATE_RAD_S = 3.0  # rotations faster than this, in rad/s, are errors of tracking: the twist counts as 0
+_DEPTH_WINDOW_S = 0.42  # depth images within this time, seconds, before and after a keyframe are sampled
+_MAX_DEPTH_SPREAD = 0.05  # relative range of neighbouring depths above which a pixel lies on an edge
+_MATCH_RATIO = 0.8  # largest ratio of the distances to the best and to the second best descriptor of a match
+_EPIPOLAR_PX = 3.0  # largest distance of a match from its epipolar line, pixels
+_MATCHED_OFFSETS = (1, 2, 3, 5, 8)  # each keyframe is matched with the keyframes this many places before it
+_MIN_MATCHES = 12  # fewest matches of two keyframes, before and after outlier rejection
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Keyframe:
-    """One frame of a drive.
+    """A frame of a drive with its *n* features and the depths at them.
 
-    ``row`` counts frames; ``depths_m`` ``(4, n)`` at the features in each of `FLIPS`, NaN where there is none
-    or an edge, and ``noise`` is that of depth.  ``T_world_camera`` is the pose that was tracked, None where
-    it was lost, and ``twist_s`` ``(6,)`` how its inverse changes in a second, a twist on the left.
-    ``around`` holds ``(seconds later, (n,) depths at the features)`` of frames near in time.
+    Attributes:
+        row: Index of the frame among all frames of the drive.
+        timestamp_s: Time stamp of the colour image, seconds.
+        camera: Stated intrinsics of the colour image.
+        pixels: ``(n, 2)``, undistorted pixels of the features.
+        sizes: ``(n,)``, scales of the features, 1 for the finest.
+        descriptors: ORB descriptors of the features, one row each.
+        depths_m: ``(4, n)``, depths at the features for each of `FLIPS`, metres; NaN without a valid depth
+            or on an edge.  A stereo pair has depths in the first row only.
+        noise: Noise model of these depths.
+        twist_s: ``(6,)``, translation (m) and rotation (rad) per second of the twist that multiplies
+            ``T_camera_world`` on the left; 0 where it is not known.
+        T_world_camera: The tracked pose ``(4, 4)``; None if tracking was lost.
+        around: Pairs of a time difference, seconds after this frame (negative for before), and the depths
+            ``(n,)`` at its features in the depth image of that time, metres.
     """
 
     row: int
@@ -67,7 +82,7 @@ class Keyframe:
 
 
 class KeyframeStore:
-    """Take the frames of a drive in order, and keep up to 56 of them, spread over it."""
+    """Select up to 56 keyframes, spread over a drive, from its frames in the order of time."""
 
     def __init__(self) -> None:
         self.keyframes: list[Keyframe] = []
@@ -78,62 +93,69 @@ class KeyframeStore:
         self._twist_s: Array = np.zeros(6)
         self._depths: deque[tuple[float, npt.NDArray[np.float32]]] = deque()
         self._tried_s = -np.inf
-        self._moved_share = _MOVED_SHARE
+        self._moved_share = _MIN_MOVED_SHARE
 
     def add(self, frame: Frame, T_world_camera: Array | None, found: Features | None = None) -> None:
-        """Look at one frame, at the pose that was tracked for it, and at the features that were found.
+        """Add the next frame, and make it a keyframe if its features moved far enough since the last one.
 
-        ORB features are found here where *found* is None or of another kind, such as vectors without sizes.
+        Args:
+            frame: The frame.
+            T_world_camera: Its tracked pose; None if tracking was lost.
+            found: The features of the tracker.  If they are None, not ORB, or without sizes or orientations,
+                ORB features are extracted here.
         """
-        self._move(frame.timestamp_s, T_world_camera)
-        self._surround(frame)
+        self._update_twist(frame.timestamp_s, T_world_camera)
+        self._sample_depths(frame)
         self.frames += 1
-        if 0.0 <= frame.timestamp_s - self._tried_s < _CANDIDATE_S:
+        if 0.0 <= frame.timestamp_s - self._tried_s < _CANDIDATE_INTERVAL_S:
             return
         self._tried_s = frame.timestamp_s
         described = _described(frame, found)
-        if len(described.pixels) < _FEW or not self._is_new(described, frame.camera.width):
+        if len(described.pixels) < _MIN_FEATURES or not self._is_new(described, frame.camera.width):
             return
-        self.keyframes.append(self._made(frame, described, T_world_camera))
-        if len(self.keyframes) > _MOST:
+        self.keyframes.append(self._make_keyframe(frame, described, T_world_camera))
+        if len(self.keyframes) > _MAX_KEYFRAMES:
             del self.keyframes[1::2]
             self._moved_share *= 1.6
 
-    def _move(self, stamp_s: float, T_world_camera: Array | None) -> None:
-        """Take how fast the camera moves from its last pose to this one; the last keyframe gets the mean."""
+    def _update_twist(self, stamp_s: float, T_world_camera: Array | None) -> None:
+        """Compute the twist of the camera from the last frame to this one, 0 without two poses in a row.
+
+        If the last frame is a keyframe, its twist becomes the mean of the twists before and after it.
+        """
         last, self._last = self._last, None if T_world_camera is None else (stamp_s, T_world_camera)
         before, self._twist_s = self._twist_s, np.zeros(6)
-        if last is None or T_world_camera is None or not 0.0 < stamp_s - last[0] < _AROUND_S:
+        if last is None or T_world_camera is None or not 0.0 < stamp_s - last[0] < _DEPTH_WINDOW_S:
             return
         twist = log_se3((inverse(T_world_camera) @ last[1])[None])[0] / (stamp_s - last[0])
-        if np.linalg.norm(twist[3:]) < _MOST_RAD_S:
+        if np.linalg.norm(twist[3:]) < _MAX_RATE_RAD_S:
             self._twist_s = twist
         if self.keyframes and self.keyframes[-1].timestamp_s == last[0] and before.any():
             self.keyframes[-1].twist_s = 0.5 * (before + self._twist_s)
 
-    def _surround(self, frame: Frame) -> None:
-        """Sample the new depth image at the features of the last keyframes, and keep it for those to come."""
+    def _sample_depths(self, frame: Frame) -> None:
+        """Sample the new depth image at the features of recent keyframes, and keep it for later keyframes."""
         if frame.stereo is not None or not _has_depth(frame):
             return
         for keyframe in self.keyframes[-8:]:
             apart_s = frame.timestamp_s - keyframe.timestamp_s
-            if 0.0 < apart_s <= _AROUND_S:
+            if 0.0 < apart_s <= _DEPTH_WINDOW_S:
                 keyframe.around.append((apart_s, depths_at(frame.depth_m, keyframe.pixels)))
         self._depths.append((frame.timestamp_s, frame.depth_m))
-        while frame.timestamp_s - self._depths[0][0] > _AROUND_S:
+        while frame.timestamp_s - self._depths[0][0] > _DEPTH_WINDOW_S:
             self._depths.popleft()
 
     def _is_new(self, described: DescribedKeypoints | Features, width: int) -> bool:
         if not self.keyframes:
             return True
         last = self.keyframes[-1]
-        one, other = match_all(last.descriptors, described.descriptors, ratio=_RATIO)
-        if len(one) < _FEW:
+        one, other = match_all(last.descriptors, described.descriptors, ratio=_MATCH_RATIO)
+        if len(one) < _MIN_FEATURES:
             return True
         moved = np.linalg.norm(last.pixels[one] - described.pixels[other], axis=1)
         return float(np.median(moved)) > self._moved_share * width
 
-    def _made(
+    def _make_keyframe(
         self, frame: Frame, described: DescribedKeypoints | Features, T_world_camera: Array | None
     ) -> Keyframe:
         pixels = described.pixels
@@ -165,13 +187,13 @@ class KeyframeStore:
 
 
 def _described(frame: Frame, found: Features | None) -> DescribedKeypoints | Features:
-    """Return the ORB features of a frame: those that were found, the finest where they are many."""
+    """Return the ORB features *found* by the tracker, at most 1200; else extract 500 from the image."""
     if found is None or found.kind != ORB or not (found.is_oriented and found.is_scaled):
-        return describe(frame.rgb, _FEATURES)
-    if len(found.pixels) <= _MOST_FEATURES:
+        return describe(frame.rgb, _EXTRACTED_FEATURES)
+    if len(found.pixels) <= _MAX_FEATURES:
         return found
-    # The finest: they are the same ones in the next image, which each second one would not be.
-    rows = np.sort(np.argsort(found.sizes, kind="stable")[:_MOST_FEATURES])
+    # Keep the features of the finest scales: the next image keeps the same ones, so that they still match.
+    rows = np.sort(np.argsort(found.sizes, kind="stable")[:_MAX_FEATURES])
     return replace(
         found, pixels=found.pixels[rows], descriptors=found.descriptors[rows],
         orientations=found.orientations[rows],
@@ -181,7 +203,12 @@ def _described(frame: Frame, found: Features | None) -> DescribedKeypoints | Fea
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tracks:
-    """Which features of which keyframes show one landmark: ``(n,)`` each, and how many landmarks."""
+    """Observations of landmarks by keyframes.
+
+    Observation *i* is the feature ``features[i]`` of the keyframe ``keyframes[i]``, which shows the landmark
+    ``landmarks[i]``; the three arrays ``(n,)`` are indices, sorted by keyframe.  ``count`` is the number of
+    landmarks.
+    """
 
     keyframes: Rows
     features: Rows
@@ -190,12 +217,15 @@ class Tracks:
 
 
 def tracks_of(keyframes: list[Keyframe], most: int = 3000) -> Tracks:
-    """Match keyframes with some before them, and return the longest tracks."""
+    """Match each keyframe with up to five before it, and return the tracks that span most keyframes.
+
+    Each track is one landmark, seen by two keyframes or more; at most *most* tracks are returned.
+    """
     numbers: list[Rows] = []
     count = 0
     for row, keyframe in enumerate(keyframes):
         own = np.full(len(keyframe.pixels), -1)
-        for back in _BACK:
+        for back in _MATCHED_OFFSETS:
             if row - back < 0:
                 continue
             before = keyframes[row - back]
@@ -223,31 +253,43 @@ def tracks_of(keyframes: list[Keyframe], most: int = 3000) -> Tracks:
 
 
 def matched(one: Keyframe, other: Keyframe) -> tuple[Rows, Rows]:
-    """Return rows of features of two keyframes that look alike and lie on one epipolar geometry."""
-    a, b = match_all(one.descriptors, other.descriptors, ratio=_RATIO)
-    if len(a) < _LEAST_MATCHES:
+    """Match the features of two keyframes, and reject outliers with a fundamental matrix (RANSAC).
+
+    Returns the indices of the matched features ``(m,)`` in *one* and in *other*; both are empty with fewer
+    than 12 matches.
+    """
+    a, b = match_all(one.descriptors, other.descriptors, ratio=_MATCH_RATIO)
+    if len(a) < _MIN_MATCHES:
         return a[:0], b[:0]
     cv2 = load_opencv()
     cv2.setRNGSeed(0)
     _, mask = cv2.findFundamentalMat(one.pixels[a], other.pixels[b], cv2.FM_RANSAC, _EPIPOLAR_PX, 0.99, 300)
-    if mask is None or int(mask.sum()) < _LEAST_MATCHES:
+    if mask is None or int(mask.sum()) < _MIN_MATCHES:
         return a[:0], b[:0]
     kept = np.flatnonzero(mask.ravel())
     return a[kept], b[kept]
 
 
 def _has_depth(frame: Frame) -> bool:
-    """Return whether a depth image has readings; a few pixels of it say so nearly always."""
+    """Return whether a depth image has a depth other than 0; a sample of its pixels is tried first."""
     return bool(frame.depth_m[::16, ::16].any() or frame.depth_m.any())
 
 
 def depths_at(depth_m: npt.NDArray[np.float32], pixels: Array) -> Array:
-    """Return ``(n,)`` medians of five depths around each pixel; NaN where one is missing, or on an edge."""
+    """Return the median depth ``(n,)``, metres, of each pixel and four pixels at a distance of 2 px.
+
+    NaN if one of the five depths is missing, or if they differ by more than 5 % of their median, as on an
+    edge.
+
+    Args:
+        depth_m: ``(h, w)``, depths in metres, 0 where there is none.
+        pixels: ``(n, 2)``; pixels at the border are moved inwards.
+    """
     pixels, depths_m = aligned(pixels, np.float64), np.full(len(pixels), np.nan)
     depth_m = np.asarray(depth_m, dtype=np.float32)
     strides = (stride // depth_m.itemsize for stride in depth_m.strides)
     _core_depths_at()(
-        address_of(depth_m), *depth_m.shape, *strides, address_of(pixels), len(pixels), _SPREAD,
+        address_of(depth_m), *depth_m.shape, *strides, address_of(pixels), len(pixels), _MAX_DEPTH_SPREAD,
         address_of(depths_m),
     )  # fmt: skip
     return depths_m

@@ -1,6 +1,6 @@
-"""Watch a drive frame by frame, and say at its end what is wrong with it.
+"""Collect measurements of a drive frame by frame, and find its faults at the end.
 
-Small things only are kept: figures of images, poses, features of some frames and depths around them.
+No images are kept: only statistics of images, poses, and up to 56 keyframes with features and depths.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from typing import Literal
 
 import numpy as np
 
-from client_sdk.check.calibration import CalibrationJudgement, judge_calibration
+from client_sdk.check.calibration import CalibrationCheck, check_calibration
 from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Finding, order
 from client_sdk.check.images import FrameStatistics
 from client_sdk.check.keyframes import KeyframeStore
 from client_sdk.check.motion import (
-    FEWEST_ADJUSTED,
+    MIN_ADJUSTED_KEYFRAMES,
     CameraMotion,
     MotionReference,
     check_imu,
     check_motion,
     nothing_to_compare,
 )
-from client_sdk.check.pairs import PairsJudgement, judge_pairs
+from client_sdk.check.pairs import PairsCheck, check_pairs
 from client_sdk.check.scene import SceneWatch, doubts_of_depth
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
@@ -35,18 +35,18 @@ from rse_pf.geometry import Array
 __all__ = ["DriveObserver"]
 
 _HIDING = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS, FaultKind.REPEATED}
-"""While a drive has one of these, the tracked motion is not that of the camera at its stamps."""
+"""Faults that falsify the tracked motion: with one of them, it is not compared with another motion."""
 
 
 class DriveObserver:
-    """Take all frames of a drive in order, with what was tracked of them, and judge them together."""
+    """Check a drive: `add` all frames in the order of time with their tracking results, then `finish`."""
 
     def __init__(self, reference: MotionReference | None = None, *, is_thinned: bool = False) -> None:
         """Start without frames.
 
         Args:
-            reference: An odometry or truth, which may be set later, before `finish`.
-            is_thinned: Whether frames were left out on purpose.
+            reference: Odometry or ground truth to compare with; may also be set later, before `finish`.
+            is_thinned: Whether frames were left out on purpose; then missing frames are no fault.
         """
         self.reference = reference
         self._store = KeyframeStore()
@@ -60,7 +60,7 @@ class DriveObserver:
         self._pair_offsets: Mapping[int, StereoAdjustment] = {}
 
     def add(self, frame: Frame, tracked: TrackedFrame | None = None) -> None:
-        """Look at the next frame; *tracked* has the pose that a mapper gave it, if there is one.
+        """Add the next frame, and the result of tracking it: None or a result without pose if it was lost.
 
         Raises:
             MissingExtra: OpenCV is not installed.
@@ -81,22 +81,29 @@ class DriveObserver:
             self._poses.append((frame.timestamp_s, tracked.T_world_camera, tracked.segment))
 
     def add_pairs(self, fault: PairFault | None) -> None:
-        """Take the result of `client_sdk.rigs.stereo_pair_checks.find_fault_of_frames` for the drive."""
+        """Set the fault of the stereo rig; None if there is none.
+
+        It comes from `client_sdk.rigs.stereo_pair_checks.find_fault_of_frames`.
+        """
         self._pair_fault = fault
 
     def add_offsets(self, found: Mapping[int, StereoAdjustment]) -> None:
-        """Take what `Mapper.adjust_pairs` found in a stereo drive, by segment, before `finish`."""
+        """Set the results of `Mapper.adjust_pairs` for a stereo drive, by number of the segment."""
         self._pair_offsets = found
 
     def cause_of_loss(self) -> str | None:
-        """Return why most frames without a pose have none, with what to do, if their images show it."""
+        """Return why most frames without a pose were lost, and what to do; None if images do not show it."""
         return self._images.cause_of_loss(np.array(self._is_lost, dtype=bool))
 
     def finish(self, doubts: Sequence[Doubt] = (), accepted: Iterable[str] = ()) -> CheckReport:
-        """Return what is wrong with the drive, worst first, and what it cannot tell.
+        """Find the faults of the drive, and list those that it cannot show.
 
-        While there are *doubts* about the source or its images, but for those that are *accepted*, nothing is
-        fitted to the frames: a calibration would be fitted to the damage.
+        If there are doubts about the source or its images, only these are reported, and the calibration is
+        not estimated: it would be fitted to damaged data.
+
+        Args:
+            doubts: Doubts about the source that the user has not accepted.
+            accepted: Names of doubts that the user has accepted, which also applies to those found here.
         """
         seen = [*self._images.frozen(), *self._scene.doubts()]
         if self._has_depth:
@@ -104,35 +111,38 @@ class DriveObserver:
         doubts = (*doubts, *unresolved(seen, accepted))
         if doubts:
             return CheckReport(frames=len(self._images), poses=len(self._poses), doubts=tuple(doubts))
-        findings, untold = self._images.findings()
-        calibration = judge_calibration(self._store)
+        findings, undetermined = self._images.findings()
+        calibration = check_calibration(self._store)
         findings += calibration.findings
-        untold += calibration.cannot_tell
+        undetermined += calibration.cannot_tell
         if self._pair_fault is not None:
             findings.append(_of_pairs(self._pair_fault))
-        # A wrong lens bends what near and far points say of disparities.
-        pairs = judge_pairs({} if calibration.findings else self._pair_offsets)
+        # A wrong lens falsifies the disparities, so their offset is estimated only without such a finding.
+        pairs = check_pairs({} if calibration.findings else self._pair_offsets)
         findings += pairs.findings
-        untold += pairs.cannot_tell
+        undetermined += pairs.cannot_tell
         moved, cannot, noted = self._motion(calibration, findings, pairs)
         return CheckReport(
             findings=order([*findings, *moved], calibration.noise_m),
-            cannot_tell=(*untold, *cannot),
+            cannot_tell=(*undetermined, *cannot),
             frames=len(self._images),
             poses=len(self._poses),
             notes=tuple(noted),
         )
 
     def _motion(
-        self, calibration: CalibrationJudgement, known: list[Finding], pairs: PairsJudgement
+        self, calibration: CalibrationCheck, known: list[Finding], pairs: PairsCheck
     ) -> tuple[list[Finding], list[CannotTell], list[str]]:
-        """Return what odometry, truth and IMU say of the motion."""
+        """Compare the motion with odometry, ground truth and IMU: findings, undetermined faults, and notes.
+
+        *known* are the findings so far; one of `_HIDING` among them prevents the comparison.
+        """
         by_depth = self._has_depth or self._has_stereo
         if self.reference is None and self._history is None:
             return [], nothing_to_compare(has_depth=by_depth), []
         hidden = _HIDING & {each.kind for each in order(known)}
         if hidden:
-            reason = f"{min(each.value for each in hidden)} bends the motion that would be compared"
+            reason = f"{min(each.value for each in hidden)} falsifies the motion that would be compared"
             return (
                 [],
                 [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.DEPTH_SCALE, reason)],
@@ -146,33 +156,33 @@ class DriveObserver:
         poses = np.array([each[1] for each in self._poses])[order_s]
         segments = np.array([each[2] for each in self._poses])[order_s]
         findings: list[Finding] = []
-        untold: list[CannotTell] = []
+        undetermined: list[CannotTell] = []
         notes: list[str] = []
         if self._history is not None:
             findings, notes = check_imu(self._history, stamps_s, poses)
         if self.reference is not None:
             adjusted = calibration.stamps_s, calibration.T_world_camera
-            doubt = calibration.metres_deviation if len(adjusted[0]) >= FEWEST_ADJUSTED else 0.0
+            doubt = calibration.scale_deviation if len(adjusted[0]) >= MIN_ADJUSTED_KEYFRAMES else 0.0
             by_pairs = self._pair_offsets and not calibration.findings
             motion = CameraMotion(
                 stamps_s=stamps_s, T_world_camera=pairs.moved(stamps_s, poses, segments), segments=segments,
-                metres=self._metres(), adjusted=None if by_pairs else adjusted,
-                metres_deviation=math.hypot(doubt, pairs.metres_deviation),
+                scale_source=self._scale_source(), adjusted=None if by_pairs else adjusted,
+                scale_deviation=math.hypot(doubt, pairs.scale_deviation),
             )  # fmt: skip
-            by_reference, untold = check_motion(motion, self.reference)
+            by_reference, undetermined = check_motion(motion, self.reference)
             findings = [*findings, *by_reference]
         elif by_depth:
-            untold.append(nothing_to_compare(has_depth=True)[-1])
-        return findings, untold, notes
+            undetermined.append(nothing_to_compare(has_depth=True)[-1])
+        return findings, undetermined, notes
 
-    def _metres(self) -> Literal["depth", "stereo", "none"]:
+    def _scale_source(self) -> Literal["depth", "stereo", "none"]:
         if not self._is_metric or not (self._has_depth or self._has_stereo):
             return "none"
         return "stereo" if self._has_stereo else "depth"
 
 
 def _of_pairs(fault: PairFault) -> Finding:
-    """Return the finding of a rig that is wrong."""
+    """Return the fault of a stereo rig as a finding."""
     kinds = {
         "swapped": FaultKind.SWAPPED_CAMERAS, "late": FaultKind.STAMP_DELAY,
         "rows": FaultKind.BASELINE,

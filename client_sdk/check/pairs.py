@@ -1,7 +1,8 @@
-"""Judge what the disparities of all pairs of a stereo drive lack together.
+"""Find a constant offset of all disparities of a stereo drive.
 
-Such an offset bends a path as a wrong baseline does, but of near points less than of far ones: the keyframes
-tell it by themselves.  What a baseline is compared by are the poses without it, and its doubt is theirs.
+Like a wrong baseline, the offset changes the scale of the path, but it affects far points more than near
+ones: the keyframes determine it without another sensor.  The baseline is checked with poses that are
+corrected for the offset, and the uncertainty of the offset adds to that of their scale.
 """
 
 from __future__ import annotations
@@ -17,31 +18,43 @@ from client_sdk.check.findings import CannotTell, FaultKind, Finding, matters
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from rse_pf.geometry import Array
 
-__all__ = ["PairsJudgement", "judge_pairs"]
+__all__ = ["PairsCheck", "check_pairs"]
 
 _KIND = FaultKind.DISPARITY_OFFSET
-_LEAST_KEYFRAMES = 12
-"""Fewer keyframes, 5 to 11 of MH_01, told offsets that they had not by five of their deviations."""
-_INFLATION, _UNKNOWN_PX = 1.5, 0.03
-_USUAL_PX, _WIDEST_PX, _LEAST_PX = 0.033, 0.5, 0.1
-_TOLD_PX = 0.3
+_MIN_KEYFRAMES = 12
+"""Fewest adjusted keyframes with which an offset is estimated.  With 5 to 11 keyframes of EuRoC MH_01 the
+estimate was wrong by up to five of its standard deviations."""
+_DEVIATION_INFLATION = 1.5  # factor on the standard deviation of the adjustment, which is too small
+_MODEL_DEVIATION_PX = 0.03  # standard deviation of the offset, px, that remains in every drive
+_USUAL_DEVIATION_PX = 0.033  # standard deviation of the offset of a good calibration, px
+_FAULT_DEVIATION_PX = 0.5  # standard deviation of the offset of a wrong calibration, px
+_MIN_OFFSET_PX = 0.1  # smallest offset that is reported, px
+_MAX_BOUND_PX = 0.3  # largest bound (three standard deviations) with which a drive determines the offset, px
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PairsJudgement:
-    """What the pairs of a drive show.
+class PairsCheck:
+    """The result of checking the disparities of a stereo drive.
 
-    ``adjusted`` are the segments whose offset is there, and how their poses move without it.
-    ``metres_deviation``, relative, is what the offset leaves of doubt in metres.
+    Attributes:
+        findings: The offset of the disparities, if it is certain and matters.
+        cannot_tell: That fault, if the drive does not determine the offset.
+        adjusted: The adjustments of the segments that have an offset, by number of the segment.
+        scale_deviation: Relative standard deviation of the metric scale that results from the uncertainty of
+            the offset.
     """
 
     findings: tuple[Finding, ...] = ()
     cannot_tell: tuple[CannotTell, ...] = ()
     adjusted: Mapping[int, StereoAdjustment] = field(default_factory=dict)
-    metres_deviation: float = 0.0
+    scale_deviation: float = 0.0
 
     def moved(self, stamps_s: Array, T_world_camera: Array, segments: Array) -> Array:
-        """Return ``(n, 4, 4)`` poses without the offset; *segments* ``(n,)`` are those of the poses."""
+        """Return the poses ``(n, 4, 4)``, corrected for the offset of the disparities of their segment.
+
+        *stamps_s* and *segments* ``(n,)`` are times and segments of the poses; poses of a segment without an
+        offset stay as they are.
+        """
         poses: Array = T_world_camera.copy()
         for number, found in self.adjusted.items():
             own = segments == number
@@ -50,16 +63,20 @@ class PairsJudgement:
         return poses
 
 
-def judge_pairs(found: Mapping[int, StereoAdjustment]) -> PairsJudgement:
-    """Return what is wrong with the disparities of a drive; *found* is by segment, the longest one counts."""
+def check_pairs(found: Mapping[int, StereoAdjustment]) -> PairsCheck:
+    """Check the offset of the disparities of a stereo drive; an empty result without adjustments.
+
+    The finding is that of the segment with most keyframes.  *found* are the adjustments by number of the
+    segment.
+    """
     if not found:
-        return PairsJudgement()
+        return PairsCheck()
     longest = max(found.values(), key=lambda each: len(each.stamps_s))
     growth, keyframes = abs(longest.growth_per_px), len(longest.stamps_s)
-    if keyframes < _LEAST_KEYFRAMES:
-        reason = f"{keyframes} keyframes do not tell an offset of disparities"
-        return PairsJudgement(
-            cannot_tell=(CannotTell(_KIND, reason),), metres_deviation=growth * _WIDEST_PX
+    if keyframes < _MIN_KEYFRAMES:
+        reason = f"{keyframes} keyframes do not determine an offset of disparities"
+        return PairsCheck(
+            cannot_tell=(CannotTell(_KIND, reason),), scale_deviation=growth * _FAULT_DEVIATION_PX
         )  # fmt: skip
     measured = _measured(longest)
     causes = explain(measured).causes
@@ -67,27 +84,27 @@ def judge_pairs(found: Mapping[int, StereoAdjustment]) -> PairsJudgement:
     _, covariance = measured.under([_KIND])
     offset_px, deviation_px = float(values[0]), math.sqrt(float(covariance[0, 0]))
     cost_m = abs(offset_px) * longest.bend_m_per_px
-    is_large = causes and abs(offset_px) > max(_LEAST_PX, 3.0 * deviation_px)
+    is_large = causes and abs(offset_px) > max(_MIN_OFFSET_PX, 3.0 * deviation_px)
     findings: tuple[Finding, ...] = ()
-    untold: tuple[CannotTell, ...] = ()
+    undetermined: tuple[CannotTell, ...] = ()
     if is_large and matters(cost_m, longest.noise_m):
         findings = (_finding(offset_px, deviation_px, cost_m),)
-    elif 3.0 * deviation_px > _TOLD_PX:
+    elif 3.0 * deviation_px > _MAX_BOUND_PX:
         within = 3.0 * deviation_px
         reason = f"points near and far agree on the disparities within {within:.1f} px only"
-        untold = (CannotTell(_KIND, reason, within),)
+        undetermined = (CannotTell(_KIND, reason, within),)
     adjusted = {n: each for n, each in found.items() if _KIND in explain(_measured(each)).causes}
-    return PairsJudgement(
-        findings=findings, cannot_tell=untold, adjusted=adjusted, metres_deviation=growth * deviation_px
+    return PairsCheck(
+        findings=findings, cannot_tell=undetermined, adjusted=adjusted, scale_deviation=growth * deviation_px
     )
 
 
 def _measured(found: StereoAdjustment) -> Measured:
     return Measured(
         values=np.array([found.offset_px]),
-        covariance=np.array([[(_INFLATION * found.deviation_px) ** 2]]),
-        unknown=np.array([_UNKNOWN_PX]), usual=np.array([_USUAL_PX]), widest=np.array([_WIDEST_PX]),
-        causes={_KIND: (0,)},
+        covariance=np.array([[(_DEVIATION_INFLATION * found.deviation_px) ** 2]]),
+        unknown=np.array([_MODEL_DEVIATION_PX]), usual=np.array([_USUAL_DEVIATION_PX]),
+        widest=np.array([_FAULT_DEVIATION_PX]), causes={_KIND: (0,)},
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
-"""Find what makes a drive unusable though each image is good: patterns that stand still, and moving objects.
+"""Find static patterns, moving objects and depth along the ray, which spoil a drive whose images are good.
 
-Where the tracked camera moves, the whole image must change.  Blocks of the image that look the same a second
-later belong to a projector, to an overlay, or to a world that stands still while something large moves before
-a camera at rest.
+While the tracked camera moves, the whole image must change.  Blocks of the image that are unchanged a second
+later belong to the pattern of a projector or to an overlay; or the camera is stationary, and its tracked pose
+follows something large that moves in the view.
 """
 
 from __future__ import annotations
@@ -23,30 +23,38 @@ from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
 
 __all__ = ["SceneWatch", "doubts_of_depth"]
 
-_EVERY_S = 0.38  # two frames in succession are looked at, since a projector may be on in each second one
-_APART_S = 1.0  # between two images that are compared
-_LINES = 60  # image rows that are compared
-_ROWS = 6  # blocks of an image from top to bottom
-_COLUMNS = 8  # blocks of an image from left to right
-_DARK_LEVEL = 8  # darker pixels lie beyond the border of an undistorted image
-_LEAST_TEXTURE = 150.0  # mean square of a block's second differences; the noise of a sensor has less
-_FEWEST_BLOCKS = 6  # with texture
-_MOVED_PX = 10.0  # the pose moves the image by as much
-_SAME = 0.6  # correlation of a block that stands still; of one that moves it is below 0.1
-_FEWEST_IMAGES = 3
-_WHOLE = 0.7  # of the blocks stand still: a pattern lies over the whole image
-_PART = 0.1  # of the blocks stand still: a part of the image; healthy drives have 0.03 at most
-_OFTEN = 0.2  # share of the images that show a static pattern: more are a finding
-_MOSTLY = 0.5  # share of the images in which a part is stationary: more are a finding
-_ALWAYS = 0.8  # share of the images in which a block of an overlay is stationary
-_MAX_RATIO = 0.2  # of depths, as a logarithm: readings that differ by more show another surface
-_RAY_SLOPE = 0.4  # depth along the ray has 1, depth along the axis 0; healthy drives have 0.15 at most
-_RAY_DEVIATION = 0.1  # a drive that tells the slope less exactly tells nothing
+_EVERY_S = 0.38
+"""Shortest time, seconds, between two samples of a drive.  A sample is two frames in succession, since a
+projector may be on in every second frame only."""
+_APART_S = 1.0  # shortest time, seconds, between two images that are compared
+_LINES = 60  # number of image rows that are compared
+_ROWS = 6  # number of blocks of an image from top to bottom
+_COLUMNS = 8  # number of blocks of an image from left to right
+_DARK_LEVEL = 8  # pixels up to this grey level of 255 count as the black border of an undistorted image
+# Smallest mean square of the second differences of a block with texture; the noise of a sensor has less.
+_MIN_TEXTURE = 150.0
+_MIN_BLOCKS = 6  # fewest blocks with texture with which two images are compared
+_MIN_MOVED_PX = 10.0  # smallest motion of the image, by its poses, between two images that are compared
+_MIN_CORRELATION = 0.6  # correlation of a block from which it is unchanged; moving ones have less than 0.1
+_MIN_IMAGES = 3  # fewest images with a pattern or with moving objects that are reported
+_WHOLE = 0.7  # share of unchanged blocks from which a pattern covers the whole image
+_PART = 0.1  # share of unchanged blocks from which a part of the image is static; good drives have up to 0.03
+_OFTEN = 0.2  # smallest share of images with a pattern over the whole image that is reported
+_MOSTLY = 0.5  # smallest share of images with a static part that is reported as moving objects
+_ALWAYS = 0.8  # share of the images in which a block must be unchanged to belong to an overlay
+# Largest ratio, as a natural logarithm, of two depths of one point; a larger one shows another surface.
+_MAX_RATIO = 0.2
+_RAY_SLOPE = 0.4  # slope from which depth is along the ray: it has 1, depth along the axis at most 0.15
+_RAY_DEVIATION = 0.1  # largest standard deviation of the slope with which a drive is classified
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _View:
-    """``edges`` ``(48, n)`` are second differences along rows of each block, ``texture`` mean squares."""
+    """A sampled image of a drive.
+
+    ``edges`` ``(48, n)`` are the second differences along image rows of its 48 blocks, ``texture`` ``(48,)``
+    their mean squares, and ``T_world_camera`` the tracked pose.
+    """
 
     stamp_s: float
     edges: npt.NDArray[np.float32]
@@ -55,7 +63,7 @@ class _View:
 
 
 class SceneWatch:
-    """Take all frames of a drive, and keep which blocks of the image stand still while the camera moves."""
+    """Find blocks of the image that are unchanged while the camera moves; takes all frames in order."""
 
     def __init__(self) -> None:
         self._views: deque[_View] = deque()
@@ -66,7 +74,7 @@ class SceneWatch:
         self._still: list[npt.NDArray[np.bool_]] = []
 
     def add(self, frame: Frame, tracked: TrackedFrame) -> None:
-        """Look at the next frame; one without a pose is taken to be where the last one was."""
+        """Add the next frame; without a pose, it counts as taken from the last known pose."""
         if tracked.T_world_camera is not None:
             self._T_world_camera = tracked.T_world_camera
         if self._T_world_camera is None or not self._is_due(frame.timestamp_s):
@@ -82,7 +90,7 @@ class SceneWatch:
             self._views.popleft()
         before = [each for each in self._views if view.stamp_s - each.stamp_s >= _APART_S]
         depth_m = _median_depth(tracked) if before else math.inf
-        moved = [each for each in before if _moved_px(each, view, frame.camera, depth_m) >= _MOVED_PX]
+        moved = [each for each in before if _moved_px(each, view, frame.camera, depth_m) >= _MIN_MOVED_PX]
         if moved:
             self._compare(moved, view)
         self._views.append(view)
@@ -97,35 +105,34 @@ class SceneWatch:
     def _compare(self, before: Sequence[_View], view: _View) -> None:
         textured, still = [], []
         for each in before:
-            has_texture = np.minimum(each.texture, view.texture) > _LEAST_TEXTURE
+            has_texture = np.minimum(each.texture, view.texture) > _MIN_TEXTURE
             likeness = (each.edges * view.edges).mean(axis=1)
             textured.append(has_texture)
-            still.append(has_texture & (likeness > _SAME * np.sqrt(each.texture * view.texture)))
+            still.append(has_texture & (likeness > _MIN_CORRELATION * np.sqrt(each.texture * view.texture)))
         row = int(np.argmax([each.sum() for each in still]))
-        if textured[row].sum() >= _FEWEST_BLOCKS:
+        if textured[row].sum() >= _MIN_BLOCKS:
             self._textured.append(textured[row])
             self._still.append(still[row])
 
     def doubts(self) -> tuple[Doubt, ...]:
-        """Return what stands still in the image while the camera moves."""
-        if len(self._still) < _FEWEST_IMAGES:
+        """Return a doubt about a static pattern or about moving objects; empty if there is neither."""
+        if len(self._still) < _MIN_IMAGES:
             return ()
         textured, still = np.array(self._textured), np.array(self._still)
         shares = still.sum(axis=1) / textured.sum(axis=1)
         is_whole, is_part = shares >= _WHOLE, shares >= _PART
-        always = still.sum(axis=0) > _ALWAYS * np.maximum(_FEWEST_IMAGES, textured.sum(axis=0))
+        always = still.sum(axis=0) > _ALWAYS * np.maximum(_MIN_IMAGES, textured.sum(axis=0))
         percent = f"{100 * np.median(shares[is_part]) if is_part.any() else 0:.0f} % of the image"
         seen = f"in {np.count_nonzero(is_part)} of {len(shares)} images"
-        if is_whole.sum() >= max(_FEWEST_IMAGES, _OFTEN * len(shares)) or always.mean() >= _PART:
+        if is_whole.sum() >= max(_MIN_IMAGES, _OFTEN * len(shares)) or always.mean() >= _PART:
             sentence = (
-                f"{percent} looks the same a second later {seen}, though the pose moves: "
-                "a pattern lies over it"
+                f"{percent} is unchanged a second later {seen}, though the pose moves: a pattern lies over it"
             )
             hint = "switch the projector off, or keep overlays and parts of the robot out of the image"
             return (Doubt(name=DoubtName.STATIC_PATTERN, sentence=sentence, hint=hint),)
-        if is_part.sum() >= max(_FEWEST_IMAGES, _MOSTLY * len(shares)):
+        if is_part.sum() >= max(_MIN_IMAGES, _MOSTLY * len(shares)):
             sentence = (
-                f"{percent} stands still {seen}, though the pose moves: something large moves in the view"
+                f"{percent} is stationary {seen}, though the pose moves: something large moves in the view"
             )
             hint = "keep people and things that move out of most of the view"
             return (Doubt(name=DoubtName.MOVING_OBJECTS, sentence=sentence, hint=hint),)
@@ -133,7 +140,10 @@ class SceneWatch:
 
 
 def _edges(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32] | None:
-    """Return ``(48, n)`` second differences along some rows of an image; None if it is too small."""
+    """Return second differences ``(48, n)`` along 60 rows of an image, for each of its 48 blocks.
+
+    None if the image has fewer than 60 rows or 64 columns.  Differences at dark pixels are 0.
+    """
     height, width = rgb.shape[:2]
     if height < _LINES or width < 8 * _COLUMNS:
         return None
@@ -147,14 +157,14 @@ def _edges(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32] | None:
 
 
 def _median_depth(tracked: TrackedFrame) -> float:
-    """Return the median depth of a frame's features, infinity where none has a depth."""
+    """Return the median depth of a frame's features, metres; infinity if no feature has a depth."""
     points = None if tracked.features is None else tracked.features.points_camera[:, 2]
     depths_m = np.empty(0) if points is None else points[points > 0.0]
     return float(np.median(depths_m)) if len(depths_m) else math.inf
 
 
 def _moved_px(before: _View, view: _View, camera: Camera, depth_m: float) -> float:
-    """Return by how much the pose moves the image between two views, at a depth."""
+    """Return about how far a point at *depth_m* moves in the image between the poses of two views, px."""
     moved_m, turned_deg = pose_difference(before.T_world_camera, view.T_world_camera)
     return camera.fx * (moved_m / depth_m + float(np.radians(turned_deg)))
 
@@ -162,9 +172,10 @@ def _moved_px(before: _View, view: _View, camera: Camera, depth_m: float) -> flo
 def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
     """Return a doubt if the depth of a drive is measured along the ray, as some simulators write it.
 
-    Such depth is too long by the length of the ray to a pixel, at depth 1.  Readings of one point from two
-    keyframes then differ by the ratio of both lengths; the slope of one logarithm over the other is 1.  Depth
-    that is mirrored may have any slope; it agrees better where it is turned back.
+    Such a depth is too large by the length of the vector ``(x, y, 1)`` to its pixel.  Depths of one point
+    from two keyframes then differ by the ratio of these lengths: in logarithms, the depths have the slope 1
+    over the lengths; correct depths have the slope 0.  Flipped depth images may have any slope, so there is
+    no doubt if another flip agrees better.
     """
     ratios = _all_ratios(keyframes, 0)
     if ratios is None:
@@ -191,7 +202,10 @@ def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
 
 
 def _all_ratios(keyframes: Sequence[Keyframe], flip: int) -> tuple[Array, Array] | None:
-    """Return `_ratios` of all neighbours, with the depth images turned as in row *flip* of `FLIPS`."""
+    """Return the `_ratios` of all successive keyframes together, with depth images flipped as `FLIPS[flip]`.
+
+    None if no two successive keyframes have enough depths in common.
+    """
     pairs = [_ratios(one, other, flip) for one, other in itertools.pairwise(keyframes)]
     known = [pair for pair in pairs if pair is not None]
     if not known:
@@ -201,7 +215,12 @@ def _all_ratios(keyframes: Sequence[Keyframe], flip: int) -> tuple[Array, Array]
 
 
 def _ratios(before: Keyframe, keyframe: Keyframe, flip: int) -> tuple[Array, Array] | None:
-    """Return logarithms ``(n,)``: of the ratio of a point's rays, and of its depth over the expected one."""
+    """Return for points seen by two keyframes the logarithms ``(n,)`` of two ratios.
+
+    The first is the length of the ray to the point in *keyframe* over that in *before*; the second the depth
+    in *keyframe* over the depth expected from *before*, minus its median.  None without two poses or with
+    fewer than 12 points.
+    """
     if before.T_world_camera is None or keyframe.T_world_camera is None:
         return None
     one, other = matched(before, keyframe)
@@ -219,7 +238,7 @@ def _ratios(before: Keyframe, keyframe: Keyframe, flip: int) -> tuple[Array, Arr
 
 
 def _log_rays(keyframe: Keyframe, rows: npt.NDArray[np.int64]) -> Array:
-    """Return the logarithm of the length of the rays of some features, at depth 1."""
+    """Return the logarithms ``(n,)`` of the lengths of the rays ``(x, y, 1)`` to the features *rows*."""
     rays = keyframe.camera.back_project(keyframe.pixels[rows], np.ones(len(rows)))
     lengths: Array = np.log(np.linalg.norm(rays, axis=1))
     return lengths

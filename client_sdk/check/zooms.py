@@ -1,7 +1,8 @@
-"""Judge whether the focal length of a drive changes: two cameras, or a lens that focuses.
+"""Find out whether the focal length changes during a drive: two cameras, or a lens that focuses.
 
-Two cameras are told by jumps from one view to the next, which the errors of depth do not make; a lens that
-focuses by a change that goes on through all parts of the drive, which they do make.
+A zoom is the natural logarithm of the focal length of a keyframe over the common one.  Two cameras show as
+jumps from one view to the next, which errors of depth do not cause.  A lens that focuses shows as a steady
+change through all parts of the drive, which errors of depth may cause, too.
 """
 
 from __future__ import annotations
@@ -16,27 +17,34 @@ from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from rse_pf.geometry import Array, inverse
 from rse_pf.slam.self_calibration import Calibrated, rms_after_alignment
 
-__all__ = ["ZoomJudgement", "judge_zooms"]
+__all__ = ["ZoomCheck", "check_zooms"]
 
-_LEAST_JUMP, _LEAST_MOVE = 0.03, 0.02
-_DEVIATIONS, _CLEAR, _HINT = 3.0, 6.0, 1.5
-_UNEVEN = 0.2
-"""Jumps of two cameras are of one size, but for this share of it."""
-_FLOOR, _INFLATION = 0.005, 1.5
-_PARTS, _MAINLY = 5, 2.0
-_QUANTILE, _OF_NORMAL = 0.3, 0.385
-"""Of the absolute steps of a normal distribution; up to half of the steps may be jumps."""
-_TOLD = 0.08
-"""A drive that could hide a larger change of the focal length cannot tell one."""
+_MIN_JUMP = 0.03  # smallest difference of two successive zooms that is a jump
+_MIN_CHANGE = 0.02  # smallest change of the zoom over a drive that is reported
+_CERTAIN_SIGMAS = 3.0  # a change of the zoom is certain if it exceeds this many standard deviations
+_JUMP_SIGMAS = 6.0  # a jump of the zoom exceeds this many standard deviations of its step
+_HINT_SIGMAS = 1.5  # a change of more than this many standard deviations is passed on as a hint
+_MAX_JUMP_DIFFERENCE = 0.2  # largest difference of a jump from the mean jump of two cameras, as a share of it
+_MODEL_DEVIATION = 0.005  # standard deviation of a zoom that remains in every drive
+_DEVIATION_INFLATION = 1.5  # factor on the standard deviations of the adjustment, which are too small
+_PARTS = 5  # number of parts of a drive whose rates of change are compared, and fewest keyframes for it
+# The parts of a drive disagree if their deviation exceeds this many times that of the adjustment.
+_DISAGREEMENT_RATIO = 2.0
+_QUANTILE = 0.3
+"""Quantile of the absolute steps from which their noise is computed.  It is below the median, so that up to
+half of the steps may be jumps."""
+_NORMAL_QUANTILE = 0.385  # this quantile of the absolute values of a normal distribution with deviation 1
+_MAX_BOUND = 0.08  # largest bound (three standard deviations) with which a drive determines the change
 
 Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ZoomJudgement:
-    """A focal length that changes, None if it does not, and what of it cannot be told.
+class ZoomCheck:
+    """The result of checking whether the focal length changes.
 
-    ``hint`` is by how much it seems to change where that is not certain, 0 where nothing speaks for it.
+    ``finding`` is the change, or None if there is no certain one.  ``hint`` is the relative change over the
+    drive that is likely but not certain, else 0.  ``cannot_tell`` lists what the drive does not determine.
     """
 
     finding: Finding | None = None
@@ -44,48 +52,57 @@ class ZoomJudgement:
     cannot_tell: tuple[CannotTell, ...] = ()
 
 
-def judge_zooms(zoomed: Calibrated, times_s: Array, common: Calibrated) -> ZoomJudgement:
-    """Return whether the focal length is the same all the time.
+def check_zooms(zoomed: Calibrated, times_s: Array, common: Calibrated) -> ZoomCheck:
+    """Find out whether the focal length jumps or moves during a drive; no result with fewer than 5 keyframes.
 
     Args:
-        zoomed: Adjusted with a focal length for each keyframe.
-        times_s: ``(k,)``, of the keyframes.
-        common: Adjusted with one for all.
+        zoomed: The drive, adjusted with a focal length for each keyframe.
+        times_s: ``(k,)``, times of the keyframes, seconds.
+        common: The drive, adjusted with one focal length for all keyframes.
     """
     zooms = zoomed.zooms
     if len(zooms) < _PARTS:
-        return ZoomJudgement()
+        return ZoomCheck()
     steps = np.diff(zooms)
     noise = _noise(zoomed)
-    jumps = np.flatnonzero(np.abs(steps) > np.maximum(_LEAST_JUMP, _CLEAR * noise))
+    jumps = np.flatnonzero(np.abs(steps) > np.maximum(_MIN_JUMP, _JUMP_SIGMAS * noise))
     if len(jumps):
-        return _jumped(steps, jumps, noise, common, zoomed)
-    return _moved(zooms, times_s, common, zoomed)
+        return _check_jumps(steps, jumps, noise, common, zoomed)
+    return _check_steady_change(zooms, times_s, common, zoomed)
 
 
 def _noise(zoomed: Calibrated) -> Array:
-    """Return ``(k - 1,)`` deviations of the steps: what the adjustment says, and what all steps show."""
+    """Return standard deviations ``(k - 1,)`` of the steps between successive zooms.
+
+    They combine the covariance of the adjustment with the scatter of all steps.
+    """
     own = np.diag(zoomed.zooms_covariance)
     together = np.diag(zoomed.zooms_covariance, 1)
     variances = np.maximum(own[1:] + own[:-1] - 2.0 * together, 0.0)
-    usual = float(np.quantile(np.abs(np.diff(zoomed.zooms)), _QUANTILE)) / _OF_NORMAL
-    noise: Array = np.sqrt(_INFLATION**2 * variances + usual**2)
+    usual = float(np.quantile(np.abs(np.diff(zoomed.zooms)), _QUANTILE)) / _NORMAL_QUANTILE
+    noise: Array = np.sqrt(_DEVIATION_INFLATION**2 * variances + usual**2)
     return noise
 
 
-def _jumped(steps: Array, jumps: Rows, noise: Array, common: Calibrated, zoomed: Calibrated) -> ZoomJudgement:
-    """Return two cameras where all jumps are of one size, and each goes back where the last came from."""
+def _check_jumps(
+    steps: Array, jumps: Rows, noise: Array, common: Calibrated, zoomed: Calibrated
+) -> ZoomCheck:
+    """Return the finding of two cameras if all *jumps* have one size and alternating signs.
+
+    Else return that the drive does not determine the cause.  *jumps* are indices of *steps* ``(k - 1,)``,
+    *noise* the standard deviations of the steps.
+    """
     sizes, n = np.abs(steps[jumps]), len(jumps)
     size = float(np.average(sizes, weights=1.0 / noise[jumps] ** 2))
-    deviation = math.hypot(_FLOOR, float(np.sqrt(np.square(noise[jumps]).sum())) / n)
-    apart = np.abs(sizes - size) > np.maximum(_UNEVEN * size, _DEVIATIONS * noise[jumps])
+    deviation = math.hypot(_MODEL_DEVIATION, float(np.sqrt(np.square(noise[jumps]).sum())) / n)
+    apart = np.abs(sizes - size) > np.maximum(_MAX_JUMP_DIFFERENCE * size, _CERTAIN_SIGMAS * noise[jumps])
     is_alternating = bool((np.diff(np.sign(steps[jumps])) != 0).all())
     if not is_alternating or apart.any():
         reason = (
             f"the focal length jumps by {math.expm1(sizes.min()):.0%} to {math.expm1(sizes.max()):.0%} "
             f"{n} times, which neither two cameras nor a lens that focuses explain"
         )
-        return ZoomJudgement(
+        return ZoomCheck(
             cannot_tell=tuple(
                 CannotTell(kind, reason) for kind in (FaultKind.TWO_CAMERAS, FaultKind.MOVING_FOCAL_LENGTH)
             )
@@ -93,21 +110,24 @@ def _jumped(steps: Array, jumps: Rows, noise: Array, common: Calibrated, zoomed:
     of_second = np.concatenate([[0], np.cumsum(np.isin(np.arange(len(steps)), jumps))]) % 2
     larger = int(of_second.sum()) if steps[jumps[0]] > 0 else int((1 - of_second).sum())
     ratio = math.expm1(size)
-    return ZoomJudgement(
+    return ZoomCheck(
         finding=Finding(
             kind=FaultKind.TWO_CAMERAS, value=ratio, deviation=deviation, unit="relative",
             cost_m=_cost(common, zoomed),
             sentence=(
                 f"{larger} of {len(zoomed.zooms)} views have a focal length that is {ratio:.1%} "
-                f"(+- {deviation:.1%}) larger than that of the others, as of two cameras"
+                f"(+- {deviation:.1%}) larger than that of the others: two cameras"
             ),
             fix="give the frames of each camera their own calibration, or map them apart",
         )
     )  # fmt: skip
 
 
-def _moved(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated) -> ZoomJudgement:
-    """Return a lens that focuses where all parts of the drive show the same change."""
+def _check_steady_change(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated) -> ZoomCheck:
+    """Return the finding of a lens that focuses if all parts of the drive show the same change.
+
+    Else return a hint of the change, and a bound if the drive does not determine it.
+    """
     span_s = float(np.ptp(times_s))
     rates = _rates(zooms, times_s)
     centred = times_s - times_s.mean()
@@ -115,45 +135,45 @@ def _moved(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated)
     move = float(weights @ zooms)
     own = math.sqrt(max(0.0, float(weights @ zoomed.zooms_covariance @ weights)))
     between = float(np.std(rates, ddof=1)) / math.sqrt(len(rates)) * span_s
-    deviation = _INFLATION * math.hypot(own, between, _FLOOR)
-    if abs(move) > max(_LEAST_MOVE, _DEVIATIONS * deviation):
-        return ZoomJudgement(
+    deviation = _DEVIATION_INFLATION * math.hypot(own, between, _MODEL_DEVIATION)
+    if abs(move) > max(_MIN_CHANGE, _CERTAIN_SIGMAS * deviation):
+        return ZoomCheck(
             finding=Finding(
                 kind=FaultKind.MOVING_FOCAL_LENGTH, value=math.expm1(move), deviation=deviation,
                 unit="relative", cost_m=_cost(common, zoomed),
                 sentence=(
                     f"the focal length changes by {math.expm1(move):+.1%} (+- {deviation:.1%}) in "
-                    f"{span_s:.0f} s, as of a lens that focuses"
+                    f"{span_s:.0f} s: a lens that focuses"
                 ),
                 fix="switch the autofocus off, calibrate again, and drive again",
             )
         )  # fmt: skip
-    hint = math.expm1(move) if abs(move) > max(_FLOOR, _HINT * deviation) else 0.0
-    if _DEVIATIONS * deviation <= _TOLD:
-        return ZoomJudgement(hint=hint)
+    hint = math.expm1(move) if abs(move) > max(_MODEL_DEVIATION, _HINT_SIGMAS * deviation) else 0.0
+    if _CERTAIN_SIGMAS * deviation <= _MAX_BOUND:
+        return ZoomCheck(hint=hint)
     low, high = float(rates.min()) * span_s, float(rates.max()) * span_s
     errors = "of depth or of the lens" if common.has_metric_scale else "of the lens or its distortion"
     reason = f"{len(zooms)} views do not tell more"
-    if between > _MAINLY * own:
+    if between > _DISAGREEMENT_RATIO * own:
         reason = (
-            f"parts of the drive say that the focal length changes by {low:+.0%} to {high:+.0%}, as by "
+            f"by parts of the drive, the focal length changes by {low:+.0%} to {high:+.0%}, as with "
             f"errors {errors}"
         )
-    reason += f": a change within {_DEVIATIONS * deviation:.0%}"
-    return ZoomJudgement(
+    reason += f": a change within {_CERTAIN_SIGMAS * deviation:.0%}"
+    return ZoomCheck(
         hint=hint,
-        cannot_tell=(CannotTell(FaultKind.MOVING_FOCAL_LENGTH, reason, _DEVIATIONS * deviation),),
+        cannot_tell=(CannotTell(FaultKind.MOVING_FOCAL_LENGTH, reason, _CERTAIN_SIGMAS * deviation),),
     )
 
 
 def _rates(zooms: Array, times_s: Array) -> Array:
-    """Return how fast the zooms change in each of some parts of the drive, 1/s."""
+    """Return the rate of change of the zoom, 1/s, in each of 5 consecutive parts of the drive."""
     ends = np.rint(np.linspace(0, len(zooms) - 1, _PARTS + 1)).astype(np.int64)
     rates: Array = np.diff(zooms[ends]) / np.maximum(np.diff(times_s[ends]), 1e-6)
     return rates
 
 
 def _cost(common: Calibrated, zoomed: Calibrated) -> float:
-    """Return how far apart the two paths are after alignment, root mean square in metres."""
+    """Return how far the paths of both adjustments are apart after alignment, root mean square, metres."""
     at, there = (inverse(each.T_camera_world)[:, :3, 3] for each in (common, zoomed))
     return rms_after_alignment(at, there - at, has_metric_scale=common.has_metric_scale)

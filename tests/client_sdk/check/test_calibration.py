@@ -7,14 +7,14 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from client_sdk.check.calibration import CalibrationJudgement, _Errors, judge_calibration
+from client_sdk.check.calibration import CalibrationCheck, _Errors, check_calibration
 from client_sdk.check.findings import FaultKind, Finding, order
 from client_sdk.check.keyframes import KeyframeStore
 from tests.kit.rendered_drives import Made, make_store
 
 
-def judged(made: Made) -> CalibrationJudgement:
-    return judge_calibration(make_store(made))
+def judged(made: Made) -> CalibrationCheck:
+    return check_calibration(make_store(made))
 
 
 def first(made: Made) -> Finding:
@@ -71,7 +71,7 @@ def test_both_focal_lengths_are_corrected_where_both_are_wrong_alike(
     """One of them alone bends the map more; only fx is certain here."""
     values, deviations = np.zeros(9), np.full(9, 0.01)
     values[:2], deviations[:2] = (0.06, fy), (0.01, deviation)
-    errors = _Errors(values, deviations, found=Mock(), camera=Mock())
+    errors = _Errors(values, deviations, adjusted=Mock(), camera=Mock())
 
     assert errors.with_the_other([0]) == rows
 
@@ -89,7 +89,7 @@ def test_a_drive_that_does_not_turn_cannot_tell_the_focal_length_and_says_so() -
 
 def test_a_drive_of_few_views_cannot_tell_anything_and_does_not_fail() -> None:
     for store in (KeyframeStore(), make_store(Made(views=3))):
-        checked = judge_calibration(store)
+        checked = check_calibration(store)
 
         assert checked.findings == ()
         assert FaultKind.FOCAL_LENGTH in {each.kind for each in checked.cannot_tell}

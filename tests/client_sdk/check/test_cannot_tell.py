@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from client_sdk.check.calibration import judge_calibration
+from client_sdk.check.calibration import check_calibration
 from client_sdk.check.findings import FaultKind
 from tests.kit.rendered_drives import Made, make_store
 
@@ -22,7 +22,7 @@ def stiff(**like: Any) -> Made:
 
 
 def untold(made: Made) -> dict[FaultKind, str]:
-    judgement = judge_calibration(make_store(made))
+    judgement = check_calibration(make_store(made))
     assert not judgement.findings
     return {each.kind: each.reason for each in judgement.cannot_tell}
 
@@ -66,11 +66,11 @@ def test_the_reason_is_what_the_drive_lacks(
 
 def test_a_drive_that_was_not_tracked_cannot_tell_its_lens_and_says_so() -> None:
     store = make_store(Made(seed=82, has_depth=False))
-    assert FOCAL not in {each.kind for each in judge_calibration(store).cannot_tell}
+    assert FOCAL not in {each.kind for each in check_calibration(store).cannot_tell}
     for keyframe in store.keyframes[4:]:
         keyframe.T_world_camera = None
 
-    reasons = {each.kind: each.reason for each in judge_calibration(store).cannot_tell}
+    reasons = {each.kind: each.reason for each in check_calibration(store).cannot_tell}
 
     assert "a pose in 4 of 30 views only" in reasons[FOCAL]
 
@@ -78,6 +78,6 @@ def test_a_drive_that_was_not_tracked_cannot_tell_its_lens_and_says_so() -> None
 def test_a_drive_that_cannot_tell_an_offset_of_depths_doubts_its_metres() -> None:
     flat = Made(seed=83, is_wall=True, turn=0.03, moves_m=(0.6, 0.6, 0.0))
 
-    deviations = [judge_calibration(make_store(made)).metres_deviation for made in (flat, Made(seed=83))]
+    deviations = [check_calibration(make_store(made)).scale_deviation for made in (flat, Made(seed=83))]
 
     assert deviations[0] > 0.02 > deviations[1]

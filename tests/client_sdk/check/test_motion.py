@@ -171,7 +171,7 @@ def test_what_a_pair_cannot_tell_of_its_metres_is_its_baseline() -> None:
     path = drive().T_world_camera(known_s).copy()
     near[:, :3, 3] *= 0.02
     path[:, :3, 3] *= 0.02
-    motion = CameraMotion(stamps_s=stamps(), T_world_camera=near, metres="stereo")
+    motion = CameraMotion(stamps_s=stamps(), T_world_camera=near, scale_source="stereo")
 
     _, untold = check_motion(motion, MotionReference(path=Trajectory(known_s, path)))
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from client_sdk.check import observer
-from client_sdk.check.calibration import CalibrationJudgement
+from client_sdk.check.calibration import CalibrationCheck
 from client_sdk.check.findings import CheckReport, FaultKind, Finding
 from client_sdk.check.motion import MotionReference
 from client_sdk.check.observer import DriveObserver
-from client_sdk.check.pairs import judge_pairs
+from client_sdk.check.pairs import check_pairs
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.stereo.view import StereoView
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
@@ -51,7 +51,7 @@ def adjustment(offset_px: float, deviation_px: float = 0.02, keyframes: int = KE
 
 @pytest.mark.parametrize("offset_px", [0.3, -0.3])
 def test_an_offset_is_reported_with_its_cost_and_what_to_set(offset_px: float) -> None:
-    judged = judge_pairs({0: adjustment(offset_px)})
+    judged = check_pairs({0: adjustment(offset_px)})
 
     (finding,) = judged.findings
     assert finding.kind is FaultKind.DISPARITY_OFFSET
@@ -68,16 +68,16 @@ def test_an_offset_is_reported_with_its_cost_and_what_to_set(offset_px: float) -
     ids=["of a good calibration", "not certain", "without effect"],
 )
 def test_an_offset_that_is_small_doubtful_or_harmless_is_no_finding(found: StereoAdjustment) -> None:
-    assert judge_pairs({0: found}).findings == ()
+    assert check_pairs({0: found}).findings == ()
 
 
 def test_few_keyframes_tell_no_offset_but_leave_metres_in_doubt() -> None:
-    judged = judge_pairs({0: adjustment(0.5, 0.02, keyframes=8)})
+    judged = check_pairs({0: adjustment(0.5, 0.02, keyframes=8)})
 
     assert judged.findings == ()
     assert [each.kind for each in judged.cannot_tell] == [FaultKind.DISPARITY_OFFSET]
     assert not judged.adjusted
-    assert judged.metres_deviation == pytest.approx(0.05)
+    assert judged.scale_deviation == pytest.approx(0.05)
 
 
 def checked(scale: float, offsets: dict[int, StereoAdjustment]) -> CheckReport:
@@ -123,7 +123,7 @@ def test_a_wrong_lens_leaves_no_word_about_disparities(monkeypatch: pytest.Monke
         kind=FaultKind.FOCAL_LENGTH, value=0.1, deviation=0.01, unit="relative", cost_m=0.1,
         sentence="the focal length is 10 % too large", fix="calibrate", correction={},
     )  # fmt: skip
-    monkeypatch.setattr(observer, "judge_calibration", lambda store: CalibrationJudgement(findings=(lens,)))
+    monkeypatch.setattr(observer, "check_calibration", lambda store: CalibrationCheck(findings=(lens,)))
 
     report = checked(1.03, {0: adjustment(0.3)})
 

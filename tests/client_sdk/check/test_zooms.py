@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from client_sdk.check.findings import FaultKind
-from client_sdk.check.zooms import judge_zooms
+from client_sdk.check.zooms import check_zooms
 from rse_pf.geometry import Array
 from rse_pf.slam.self_calibration import UNKNOWNS, Calibrated
 
@@ -49,11 +49,11 @@ def test_a_focal_length_that_is_not_the_same_is_found_where_it_is_known(
 ) -> None:
     common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
 
-    found = judge_zooms(adjusted(zooms, 0.001), times_s, common).finding
+    found = check_zooms(adjusted(zooms, 0.001), times_s, common).finding
 
     assert found is not None
     assert (found.kind, found.value) == (kind, pytest.approx(value, rel=0.02))
-    assert judge_zooms(adjusted(zooms, 0.2), times_s, common).finding is None
+    assert check_zooms(adjusted(zooms, 0.2), times_s, common).finding is None
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_focal_length_that_errors_of_depth_move_is_no_finding_and_this_is_said
 ) -> None:
     times_s = np.arange(VIEWS) / 2.0
 
-    judged = judge_zooms(adjusted(zooms, 0.001), times_s, adjusted(np.zeros(VIEWS), 0.001))
+    judged = check_zooms(adjusted(zooms, 0.001), times_s, adjusted(np.zeros(VIEWS), 0.001))
 
     assert judged.finding is None
     assert said in judged.cannot_tell[0].reason
@@ -74,7 +74,7 @@ def test_a_focal_length_that_errors_of_depth_move_is_no_finding_and_this_is_said
 def test_a_drive_without_depth_does_not_blame_depth() -> None:
     common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
     reasons = [
-        judge_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metric_scale=has))
+        check_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metric_scale=has))
         .cannot_tell[0]
         .reason
         for has in (True, False)
