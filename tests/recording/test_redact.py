@@ -27,7 +27,7 @@ NAMES = ("acme works", "müller-7", "m\\u00fcller-7")
 TOKEN = "eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyIn0.c2lnbmF0dXJl"
 SECRET = "of somebody else"
 CODECS = ("zlib", "json", "bin")
-POSE = {"camera": {"fx": 1.0}, "points_world": [1.0] * 12, "pixels": [2.0] * 8}
+ANSWER_WITH_POSE = {"camera": {"fx": 1.0}, "points_world": [1.0] * 12, "pixels": [2.0] * 8}
 
 
 def redactor(codec: str, robot: RobotId = ROBOT, **more: Any) -> ConnectionRedactor:
@@ -37,7 +37,7 @@ def redactor(codec: str, robot: RobotId = ROBOT, **more: Any) -> ConnectionRedac
 
 
 def command(number: int = 1, **fields: Any) -> Command:
-    return Command(id=number, service="pnp", payload=POSE, **fields)
+    return Command(id=number, service="pnp", payload=ANSWER_WITH_POSE, **fields)
 
 
 @pytest.mark.parametrize("codec", CODECS)
@@ -62,7 +62,7 @@ def test_a_command_and_its_answer_stay_as_they_were(codec: str):
         Subscribe(id=3, topic="live/kitchen"),
         Command(id=2, service="merge", payload={"robot": "müller-7"}),
         Command(id=2, service="live", payload={}),
-        Command(id=2, service="pnp", payload={**POSE, "note": TOKEN}),
+        Command(id=2, service="pnp", payload={**ANSWER_WITH_POSE, "note": TOKEN}),
     ],
 )
 def test_what_may_hold_a_token_or_a_name_is_left_out(codec: str, message: Any):
@@ -86,8 +86,8 @@ def test_an_answer_to_a_command_that_was_left_out_is_left_out(codec: str):
     "message",
     [
         command(trace="müller-7", stream="of acme works"),
-        Command(id=1, service="pnp", payload={**POSE, "note": ["I am müller-7"]}),
-        Command(id=1, service="pnp", payload={**POSE, "seen by müller-7": 1}),
+        Command(id=1, service="pnp", payload={**ANSWER_WITH_POSE, "note": ["I am müller-7"]}),
+        Command(id=1, service="pnp", payload={**ANSWER_WITH_POSE, "seen by müller-7": 1}),
         Hello(sdk="müller-7"),
     ],
 )
@@ -119,7 +119,7 @@ def test_a_welcome_names_the_pseudonym_and_a_refusal_no_robot(codec: str):
 @pytest.mark.parametrize("name", ["camera", "native", "pnp", "a", "command", "T_camera_world", "1"])
 def test_a_robot_that_has_a_word_of_the_protocol_for_a_name_changes_no_command(codec: str, name: str):
     sent = make_codec(codec).encode(
-        Command(id=1, service="pnp", payload={**POSE, "options": {"engine": "native"}}, keep=True)
+        Command(id=1, service="pnp", payload={**ANSWER_WITH_POSE, "options": {"engine": "native"}}, keep=True)
     )
 
     kept = redactor(codec, RobotId("default", name)).up(sent)

@@ -14,7 +14,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.recording.recorder_process import RecorderPlan
 from rse_pf.extensions.recording.server_recorder import FileServerRecorder
-from rse_pf.extensions.recording.tap import LOST, OPENED, UP, Handed, PipeReader, RecordingTap, hand_pipe
+from rse_pf.extensions.recording.tap import LOST, OPENED, UP, PipeEntry, PipeReader, RecordingTap, send_pipe
 from rse_pf.identity import RobotId
 
 ROBOT = RobotId("default", "robot-1")
@@ -79,7 +79,7 @@ def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key
             recorders.wait_for(count).end(-9)
         watching = next(each for each in threading.enumerate() if each.name == "recorder")
         watching.join(_DEADLINE_S)
-        is_over = hand_pipe(worker)
+        is_over = send_pipe(worker)
     os.close(worker)
 
     assert [each.restarts for each in recorders.plans] == [0, 1, 2, 3, 4, 5]
@@ -90,17 +90,17 @@ def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key
     assert events == ["recorder-restarted"] * 5 + ["recorder-given-up"]
 
 
-def entries(end: int) -> list[Handed]:
+def entries(end: int) -> list[PipeEntry]:
     return list(PipeReader().entries(os.read(end, 1 << 20)))
 
 
 def test_the_next_recorder_learns_of_open_connections_and_gets_what_waited():
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     due: list[Callable[[], None]] = []
-    first = hand_pipe(theirs.fileno())
+    first = send_pipe(theirs.fileno())
     assert first is not None
     tap = RecordingTap(
-        first, call_later=lambda seconds, call: due.append(call), renew=lambda: hand_pipe(theirs.fileno())
+        first, call_later=lambda seconds, call: due.append(call), renew=lambda: send_pipe(theirs.fileno())
     )
     kept, gone = tap.open_connection("bin", ROBOT), tap.open_connection("zlib", ROBOT)
     _, (end,), _, _ = socket.recv_fds(ours, 1, 4)

@@ -11,7 +11,7 @@ import pytest
 from rse_pf.extensions.recording.tap import (
     LOST,
     UP,
-    Handed,
+    PipeEntry,
     PipeReader,
     RecordingTap,
     recording_pipe,
@@ -48,8 +48,8 @@ def pipe() -> Iterator[tuple[int, int]]:
             continue
 
 
-def read(fd: int, reader: PipeReader) -> list[Handed]:
-    found: list[Handed] = []
+def read(fd: int, reader: PipeReader) -> list[PipeEntry]:
+    found: list[PipeEntry] = []
     try:
         while data := os.read(fd, 10_007):
             found += reader.entries(data)
@@ -67,7 +67,7 @@ def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[in
         tap.observe_received(number, bytes(100_000))
         loop.turn()
     assert 0 < tap.dropped < 150
-    reader, found = PipeReader(), list[Handed]()
+    reader, found = PipeReader(), list[PipeEntry]()
     for _ in range(400):
         found += read(pipe[0], reader)
         loop.turn()

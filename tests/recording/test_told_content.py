@@ -15,11 +15,11 @@ from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.extensions.recording.recorder_process import MessageRecorder
 from rse_pf.extensions.recording.redact import ConnectionRedactor, Pseudonyms
 from rse_pf.extensions.recording.tap import (
+    ANSWER_WITH_POSE,
+    DECODED_COMMAND,
     DOWN,
-    PLAIN,
-    POSE,
     UP,
-    Handed,
+    PipeEntry,
     PipeReader,
     RecordingTap,
     recording_pipe,
@@ -34,7 +34,7 @@ from tests.kit.worker_parts import worker_parts
 
 ROBOT = RobotId("default", "robot-seven")
 TOKEN = "eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyIn0.c2lnbmF0dXJl"
-PAIRS = {PLAIN: UP, POSE: DOWN}
+PAIRS = {DECODED_COMMAND: UP, ANSWER_WITH_POSE: DOWN}
 
 
 def register(registry: Registry) -> None:
@@ -56,7 +56,7 @@ def pipe() -> Iterator[tuple[int, int]]:
         os.close(end)
 
 
-def handed(pipe: tuple[int, int], codec: str, *messages: Any) -> list[Handed]:
+def handed(pipe: tuple[int, int], codec: str, *messages: Any) -> list[PipeEntry]:
     """Return what a worker hands over while a robot sends *messages*."""
     tap = RecordingTap(pipe[1], call_later=lambda seconds, call: None)
     with worker_parts(codec=codec, register=register) as worker:
@@ -68,17 +68,17 @@ def handed(pipe: tuple[int, int], codec: str, *messages: Any) -> list[Handed]:
     return list(PipeReader().entries(os.read(pipe[0], 1 << 20)))
 
 
-def recorded(folder: Path, entries: list[Handed], codec: str) -> list[tuple[str, int, bytes]]:
+def recorded(folder: Path, entries: list[PipeEntry], codec: str) -> list[tuple[str, int, bytes]]:
     """Return the messages of a recording of *entries*; the topics of connections without their numbers."""
     folder.mkdir()
     writer = RecordingWriter(folder, "s", started_ns=1, max_file_bytes=1 << 30, max_bytes=1 << 30)
     recorder = MessageRecorder(writer, Pseudonyms(b"k" * 32), SessionSettings(), "s")
     connection = recorder.open(codec, ROBOT)
     for kind, _, time_ns, data in entries:
-        if kind == PLAIN:
-            recorder.take_plain(connection, time_ns, data)
-        elif kind == POSE:
-            recorder.take_pose(connection, time_ns, data)
+        if kind == DECODED_COMMAND:
+            recorder.record_decoded_command(connection, time_ns, data)
+        elif kind == ANSWER_WITH_POSE:
+            recorder.record_answer_with_pose(connection, time_ns, data)
         elif kind in (UP, DOWN):
             recorder.take(connection, "up" if kind == UP else "down", time_ns, data)
     writer.close()
@@ -95,10 +95,12 @@ def test_a_command_that_was_read_and_its_answer_are_recorded_as_if_nothing_had_b
     codec: str, pipe: tuple[int, int], tmp_path: Path
 ):
     told = handed(pipe, codec, command(codec, stream="pose", keep=True), Ping(sent_s=1.0))
-    heads = {PLAIN: 9 + len("pose "), POSE: 8 + 16 * 8}
-    plain = [Handed(PAIRS.get(kind, kind), n, at, data[heads.get(kind, 0) :]) for kind, n, at, data in told]
+    heads = {DECODED_COMMAND: 9 + len("pose "), ANSWER_WITH_POSE: 8 + 16 * 8}
+    plain = [
+        PipeEntry(PAIRS.get(kind, kind), n, at, data[heads.get(kind, 0) :]) for kind, n, at, data in told
+    ]
 
-    assert [each.kind for each in told] == [1, UP, DOWN, PLAIN, POSE, UP, DOWN]
+    assert [each.kind for each in told] == [1, UP, DOWN, DECODED_COMMAND, ANSWER_WITH_POSE, UP, DOWN]
     found = recorded(tmp_path / "told", told, codec)
     assert len(found) == 7
     assert found == recorded(tmp_path / "plain", plain, codec)
@@ -122,7 +124,7 @@ def test_a_name_or_a_token_in_the_words_of_a_command_is_not_recorded(codec: str,
     data = make_codec(codec).encode(command(codec, trace=words))
     redactor = ConnectionRedactor(make_codec(codec), ROBOT, Pseudonyms(b"k" * 32), max_inflated_bytes=1 << 20)
 
-    kept = redactor.plain(5, f" {words}".encode(), data)
+    kept = redactor.decoded_command(5, f" {words}".encode(), data)
 
     if words == TOKEN:
         assert kept is None

@@ -1,4 +1,4 @@
-"""Recordings of what robots and servers said: MCAP files, how they are written and read.
+"""Recordings of the messages between robots and servers as MCAP files: format, writing and reading.
 
-Decoding in the path of a command does not belong here, nor do sockets of robots.
+Connections with robots, and the decoding of the commands that a server answers, are in `rse_pf.server`.
 """

@@ -1,6 +1,6 @@
-"""What is in a recording: the names of channels, encodings, schemas and files, and how they are read back.
+"""The format of a recording: names of files, channels, encodings and schemas, and how to parse them.
 
-A recording is one or more MCAP files.  Nothing here reads or writes one.
+A recording is one or more MCAP files.  This module neither reads nor writes files.
 
 Source:
     MCAP specification, version 0 (mcap.dev/spec); Foxglove's message schemas (docs.foxglove.dev).
@@ -24,17 +24,17 @@ __all__ = [
 ]  # fmt: skip
 
 PROFILE: Final = "rse-pf"
-"""Profile of every file, in its header."""
+"""The profile in the header of every file of a recording."""
 LIBRARY: Final = "rse-pf"
-"""The library in the header; a space and the version follow."""
+"""Name of the library in the header of a file; a space and the version of the software follow."""
 FORMAT_VERSION: Final = 1
-"""Version of what this module describes; a reader refuses newer ones."""
+"""Version of the format that this module describes; a reader rejects files with a higher one."""
 METADATA_NAME: Final = "rse_pf"
-"""Name of the metadata record at the start of every file; all its values are texts."""
+"""Name of the metadata record at the start of every file; its values are strings."""
 SUFFIX: Final = ".mcap"
 
 WIRE_ENCODING: Final = "rse-pf-wire"
-"""Message encoding of channels that hold messages as they were on the wire, before they were decoded."""
+"""Message encoding of the channels that hold the bytes of WebSocket messages as they were sent."""
 JSON_ENCODING: Final = "json"
 JSON_SCHEMA_ENCODING: Final = "jsonschema"
 
@@ -53,23 +53,23 @@ POINTS_SCHEMA: Final = "foxglove.PointCloud"
 IMAGE_SCHEMA: Final = "foxglove.CompressedImage"
 
 Direction = Literal["up", "down"]
-"""``up``: from the robot to the server."""
+"""Direction of a message: ``up`` from the robot to the server, ``down`` from the server to the robot."""
 
 _WIRE_TOPIC = re.compile(r"/wire/([0-9a-f]{16})/(up|down)")
 _FILE_NAME = re.compile(r"(\d{8}T\d{6}Z)-(.+)-(\d{4,})")
-_NOT_FOR_A_FILE = re.compile(r"[^A-Za-z0-9_.-]")
-_MAX_SERVER_LETTERS = 64
-_TIME_FORMAT = "%Y%m%dT%H%M%SZ"
+_NOT_FOR_A_FILE = re.compile(r"[^A-Za-z0-9_.-]")  # characters of a server's name that a file name replaces
+_MAX_SERVER_LETTERS = 64  # largest number of characters of a server's name in a file name
+_TIME_FORMAT = "%Y%m%dT%H%M%SZ"  # the start of the recorder in a file name, UTC
 
 
 class WireChannel(NamedTuple):
-    """One connection in one direction, as its channel names them.
+    """The description of a channel that holds the messages of one connection in one direction.
 
     Attributes:
-        connection: 16 hex digits, random, the same for both directions.
+        connection: Random identifier of the connection, 16 hex digits; the same for both directions.
         direction: ``up`` or ``down``.
-        codec: ``zlib``, ``json`` or ``bin``.
-        server: Identifier of the server; "" where it is not known.
+        codec: Codec of the connection: ``zlib``, ``json`` or ``bin``.
+        server: Identifier of the server; "" if it is not known.
         robot: Pseudonym ``robot-XXXXXXXX``, the same for all connections of a robot in one recording.
         tenant: Pseudonym ``tenant-XXXXXXXX``.
     """
@@ -83,7 +83,7 @@ class WireChannel(NamedTuple):
 
 
 class FileName(NamedTuple):
-    """The name of a recording's file: when its recorder started, of which server it is, and its number."""
+    """The parts of the name of a file: start of the recorder, name of the server, and number of the file."""
 
     started: datetime
     server: str
@@ -97,7 +97,7 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return what *name* says, None if it is no such name."""
+        """Return the parts of the file name *name*; None if it is not the name of a recording."""
         match = _FILE_NAME.fullmatch(name.removesuffix(SUFFIX)) if name.endswith(SUFFIX) else None
         if match is None:
             return None
@@ -114,7 +114,7 @@ def wire_topic(connection: str, direction: Direction) -> str:
 
 
 def wire_metadata(channel: WireChannel) -> dict[str, str]:
-    """Return the metadata of the channel of a connection; its topic says the rest."""
+    """Return the metadata of a channel; its topic holds connection and direction, see `wire_topic`."""
     return {
         "codec": channel.codec,
         "server": channel.server,
@@ -124,7 +124,7 @@ def wire_metadata(channel: WireChannel) -> dict[str, str]:
 
 
 def wire_channel(topic: str, metadata: dict[str, str]) -> WireChannel | None:
-    """Return which connection a channel with this *topic* and *metadata* holds, None for another channel."""
+    """Return the description in *topic* and *metadata*; None if the channel holds no wire messages."""
     match = _WIRE_TOPIC.fullmatch(topic)
     if match is None:
         return None
@@ -175,9 +175,9 @@ SCHEMAS: Final[dict[str, bytes]] = {
     ),
     IMAGE_SCHEMA: _schema(IMAGE_SCHEMA, timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT),
 }
-"""The JSON schemas of all channels that hold JSON, by name."""
+"""The JSON schemas of all channels with the encoding `JSON_ENCODING`, by name of the schema."""
 
 
 def encode_json(value: Any) -> bytes:
-    """Return *value* as the data of a message of a JSON channel; what JSON does not know becomes text."""
+    """Encode *value* for a JSON channel; objects that JSON cannot hold are written as ``str(object)``."""
     return msgspec.json.encode(value, enc_hook=str)

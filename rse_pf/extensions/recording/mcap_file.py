@@ -1,7 +1,7 @@
-"""Write one MCAP file in chunks, so that a file that is cut off can be read up to its last whole chunk.
+"""Write an MCAP file in chunks: a file that was not finished can be read up to its last complete chunk.
 
-Rare records are encoded by the library `mcap`.  Its writer takes 20 to 30 microseconds for a message, so that
-messages, chunks and their indexes are packed here, which takes two.
+Records that are rare are encoded by the library `mcap`.  Messages, chunks and their indexes are packed here,
+which takes 2 microseconds for a message; the writer of the library takes 20 to 30.
 
 Source:
     MCAP specification, version 0 (mcap.dev/spec).
@@ -18,32 +18,40 @@ from typing import Any
 
 __all__ = ["MAX_CHUNK_BYTES", "MAX_CHUNK_NS", "McapFile"]
 
-MAX_CHUNK_BYTES = 1 << 20
-MAX_CHUNK_NS = 500_000_000
-"""A chunk is written when it is this long or this old, by the time of its first message."""
-_MAGIC = b"\x89MCAP0\r\n"
+MAX_CHUNK_BYTES = 1 << 20  # size at which a chunk is written
+MAX_CHUNK_NS = 500_000_000  # age of its first message, ns, at which a chunk is written
+_MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
+# A message record: opcode, length, channel, sequence number, log time and publish time (ns); the data
+# follows.
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_BYTES = _MESSAGE.size
-_MESSAGE_FIELDS = _MESSAGE_BYTES - 9
+_MESSAGE_FIELDS = _MESSAGE_BYTES - 9  # bytes of its fields without opcode (1) and length (8)
 _pack_message = _MESSAGE.pack
+# A chunk record: opcode, length, first and last time (ns), uncompressed size, CRC, length of the name of the
+# compression, size of the records that follow.
 _CHUNK = struct.Struct("<BQQQQIIQ")
-_CHUNK_FIELDS = _CHUNK.size - 9
+_CHUNK_FIELDS = _CHUNK.size - 9  # bytes of its fields without opcode (1) and length (8)
+# A message index record: opcode, length, channel, size of the pairs of time and offset that follow.
 _INDEX = struct.Struct("<BQHI")
+# Start of a chunk index record: opcode, length, first and last time (ns), offset and size of the chunk, size
+# of the message index offsets that follow.
 _CHUNK_INDEX = struct.Struct("<BQQQQQI")
+# End of a chunk index record: size of the message indexes, length of the name of the compression, compressed
+# and uncompressed size.
 _CHUNK_INDEX_END = struct.Struct("<QIQQ")
-_OFFSET = struct.Struct("<HQ")
-_OP_MESSAGE, _OP_CHUNK, _OP_INDEX, _OP_CHUNK_INDEX = 5, 6, 7, 8
+_OFFSET = struct.Struct("<HQ")  # one message index offset: channel, offset of the index in the file
+_OP_MESSAGE, _OP_CHUNK, _OP_INDEX, _OP_CHUNK_INDEX = 5, 6, 7, 8  # opcodes of the MCAP specification
 
 
 class McapFile:
-    """One file that is being written to a descriptor; `begin` it, add channels and messages, `finish` it.
+    """Write one MCAP file to a file descriptor: `begin`, then add channels and messages, then `finish`.
 
-    A message is in the kernel after `flush`.  A write that fails raises OSError; what was written of the
-    chunk is cut off again, so that the file stays readable.
+    A message is kept in memory until its chunk is written to the file, see `flush`.  A write that fails
+    raises OSError, and truncates the file to the last complete chunk, so that it stays readable.
     """
 
     def __init__(self, fd: int) -> None:
-        """Know the descriptor of an empty file, which stays the caller's."""
+        """Take the descriptor *fd* of an empty file, which the caller closes; nothing is written yet."""
         self.size_bytes = 0
         self._fd = fd
         self._parts: list[bytes] = []
@@ -78,7 +86,10 @@ class McapFile:
         schema: tuple[str, str, bytes] | None = None,
         metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Return the number of a new channel; *schema* is a name, an encoding and the data."""
+        """Add a channel, and return its number for `add`.
+
+        *schema* is the name, the encoding and the data of its schema; None if it has none.
+        """
         from mcap.records import Channel, Schema
 
         number = 0
@@ -98,11 +109,14 @@ class McapFile:
 
     @property
     def channels(self) -> int:
-        """How many channels the file has."""
+        """Number of the channels of the file."""
         return len(self._channels)
 
     def add(self, channel: int, time_ns: int, data: bytes) -> None:
-        """Add a message, and write the chunk if it is long or old enough."""
+        """Add a message to the chunk, and write the chunk once it has 1 MiB; raises OSError.
+
+        *time_ns* is the Unix time of the message, ns.
+        """
         offsets = self._offsets.get(channel)
         if offsets is None:
             if not self._offsets:
@@ -122,11 +136,14 @@ class McapFile:
             self.flush()
 
     def is_due(self, now_ns: int) -> bool:
-        """Return whether messages wait that should be written at *now_ns*."""
+        """Return whether the chunk is to be flushed: its first message is 0.5 s old at *now_ns*."""
         return bool(self._offsets) and now_ns - self._first_ns >= MAX_CHUNK_NS
 
     def flush(self) -> None:
-        """Write the messages that wait as a chunk with its index, if there are any; raises OSError."""
+        """Write the waiting messages as a chunk with its indexes; nothing without messages.
+
+        Raises OSError if the write fails; the messages of the chunk are then lost.
+        """
         if not self._offsets:
             return
         records = b"".join(self._parts)
@@ -148,7 +165,7 @@ class McapFile:
             indexes += (_INDEX.pack(_OP_INDEX, 6 + len(index), channel, len(index)), index)
             index_bytes += _INDEX.size + len(index)
         start = self.size_bytes
-        self._forget()
+        self._clear_chunk()
         self._write(b"".join((chunk, records, *indexes)))
         entries = b"".join(places)
         end = _CHUNK_INDEX_END.pack(index_bytes, 0, len(records), len(records))
@@ -162,7 +179,7 @@ class McapFile:
         self._span = min(before[0], span[0]), max(before[1], span[1])
 
     def finish(self) -> None:
-        """Write what waits and the summary, by which readers find any message; raises OSError."""
+        """Write the waiting messages and the summary, with which readers find any message; raises OSError."""
         from mcap.records import DataEnd, Footer, Statistics
 
         self.flush()
@@ -185,11 +202,11 @@ class McapFile:
         self._parts.append(data)
         self._chunk_bytes += len(data)
 
-    def _forget(self) -> None:
+    def _clear_chunk(self) -> None:
         self._parts, self._offsets, self._chunk_bytes = [], {}, 0
 
     def _write(self, data: bytes) -> None:
-        """Append *data* to the file, or cut off what was written of it and raise OSError."""
+        """Append *data* to the file, or truncate the file to its former size and raise OSError."""
         rest = memoryview(data)
         try:
             while rest:
@@ -202,7 +219,7 @@ class McapFile:
 
 
 def _record(record: Any) -> bytes:
-    """Return the bytes of a record of the library `mcap`."""
+    """Encode a record object of the library `mcap`."""
     from mcap.data_stream import RecordBuilder
 
     builder: Any = RecordBuilder()

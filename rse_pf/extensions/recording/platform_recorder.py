@@ -1,7 +1,7 @@
 """Record the events of a local platform and the samples of its monitor.
 
-The recorder also makes the key of the pseudonyms, which all servers of a recording share, and deletes it at
-the end.  A full disk neither delays nor ends the platform.
+The recorder also creates the key of the pseudonyms, which all servers of a recording use, and deletes it at
+the end.  A full disk neither delays nor stops the platform.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from rse_pf.storage.files import create_private_file
 
 __all__ = ["FilePlatformRecorder", "make_platform_recorder"]
 
-_CONTROL_PLANE = "control-plane"
-_KEY_BYTES = 32
-_LEFT_OUT = ("robot", "robots_named", "tenant", "token", "url")
-"""Fields of events that may hold a name or an address."""
+_CONTROL_PLANE = "control-plane"  # name of the server in the names of the files
+_KEY_BYTES = 32  # size of the key of the pseudonyms
+_UNRECORDED_FIELDS = ("robot", "robots_named", "tenant", "token", "url")
+"""Fields of events that are not recorded, since they may hold a name, a secret or an address."""
 
 
 def make_platform_recorder(settings: PlatformSettings, state: Path) -> FilePlatformRecorder | None:
-    """Return the recorder of the platform in the folder *state*, None if *settings* ask for no recording."""
+    """Return the recorder of the platform in the folder *state*; None if no folder for recordings is set."""
     return FilePlatformRecorder(settings, state) if settings.recording.folder else None
 
 
 class FilePlatformRecorder:
-    """Record one platform in a file; a `rse_pf.local.control.platform_recorder.PlatformRecorder`."""
+    """Record one platform in files; implements `rse_pf.local.control.platform_recorder.PlatformRecorder`."""
 
     def __init__(
         self, settings: PlatformSettings, state: Path, time_ns: Callable[[], int] = time.time_ns
@@ -44,7 +44,7 @@ class FilePlatformRecorder:
         self._writer: RecordingWriter | None = None
 
     def begin(self) -> None:
-        """Make the key of the pseudonyms, unless an earlier control plane left one; begin the file."""
+        """Create the key of the pseudonyms unless an earlier control plane left one; prepare the file."""
         recording = self._recording
         with suppress(FileExistsError):
             create_private_file(self._key, secrets.token_hex(_KEY_BYTES))
@@ -59,12 +59,12 @@ class FilePlatformRecorder:
         self._write(SAMPLES_TOPIC, SAMPLE_SCHEMA, dict(sample))
 
     def record_event(self, event: Mapping[str, Any]) -> None:
-        """Record one event of the platform."""
-        details = {name: value for name, value in event.items() if name not in (*_LEFT_OUT, "event")}
+        """Record one event of the platform without the fields that may hold names, secrets or addresses."""
+        details = {name: value for name, value in event.items() if name not in (*_UNRECORDED_FIELDS, "event")}
         self._write(EVENTS_TOPIC, EVENT_SCHEMA, {"kind": event["event"], **details})
 
     def close(self) -> None:
-        """Finish the file, and throw the key away."""
+        """Finish the file, and delete the key of the pseudonyms."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None

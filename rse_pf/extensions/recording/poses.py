@@ -1,6 +1,6 @@
-"""Make the messages that Foxglove shows: poses, point clouds and images, after its schemas.
+"""Make messages for Foxglove by its schemas: poses, point clouds and images.
 
-Numbers only, without numpy: the recorder process calls this for every answer.
+The module does not import numpy, since the recorder process calls it for every answer.
 
 Source:
     Foxglove's message schemas PoseInFrame, PointCloud and CompressedImage (docs.foxglove.dev).
@@ -19,13 +19,13 @@ import msgspec
 __all__ = ["WORLD_FRAME", "image", "inverse", "point_cloud", "pose_in_frame", "read_answered_pose"]
 
 WORLD_FRAME = "world"
-"""The frame of the points of a robot's commands."""
-_FLOAT32 = 7
-"""Foxglove's NumericType."""
-_NS = 1_000_000_000
-_POINT_BYTES = 12
+"""Name of the coordinate frame of the points in a robot's commands."""
+_FLOAT32 = 7  # value of FLOAT32 in Foxglove's NumericType
+_NS = 1_000_000_000  # nanoseconds of a second
+_POINT_BYTES = 12  # bytes of a point: x, y and z as float32
+# Format of `struct` for the numbers of a MessagePack extension of the codec ``bin``, by its type.
 _NUMBERS = {1: "f", 3: "d"}
-_NUMBER_BYTES = {1: 4, 3: 8}
+_NUMBER_BYTES = {1: 4, 3: 8}  # bytes of such a number, by type
 
 
 class _Pose(msgspec.Struct, frozen=True):
@@ -54,11 +54,13 @@ _from_binary = msgspec.msgpack.Decoder(_BinaryPoseResult, ext_hook=_numbers).dec
 
 
 def read_answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
-    """Return the 16 numbers of ``T_camera_world`` (row-major) of a `pnp` result, None if it has none.
+    """Return the 16 numbers of ``T_camera_world`` (row-major) of a `pnp` result.
+
+    None if the message holds no such pose, if one of the numbers is not finite, or if it cannot be decoded.
 
     Args:
-        text: The message, inflated.
-        is_binary: Whether its codec is ``bin``.
+        text: The inflated message.
+        is_binary: Whether the codec of the message is ``bin``.
     """
     try:
         reply = (_from_binary if is_binary else _from_json)(text).reply
@@ -69,7 +71,10 @@ def read_answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | Non
 
 
 def pose_in_frame(T_frame_camera: Sequence[float], time_ns: int, frame: str = WORLD_FRAME) -> dict[str, Any]:
-    """Return the PoseInFrame of 16 numbers (row-major) that map the camera to *frame*."""
+    """Return a PoseInFrame message of the camera's pose in *frame*.
+
+    *T_frame_camera* are 16 numbers, row-major, metres; *time_ns* is the Unix time, ns.
+    """
     (a, b, c, x, d, e, f, y, g, h, i, z) = T_frame_camera[:12]
     qx, qy, qz, qw = _quaternion((a, b, c, d, e, f, g, h, i))
     return {
@@ -83,7 +88,7 @@ def pose_in_frame(T_frame_camera: Sequence[float], time_ns: int, frame: str = WO
 
 
 def inverse(T: Sequence[float]) -> tuple[float, ...]:
-    """Return the inverse of a rigid motion of 16 numbers, row-major."""
+    """Return the inverse of a rigid transform; both are 16 numbers, row-major."""
     (a, b, c, x, d, e, f, y, g, h, i, z) = T[:12]
     return (
         a, d, g, -(a * x + d * y + g * z),
@@ -94,7 +99,7 @@ def inverse(T: Sequence[float]) -> tuple[float, ...]:
 
 
 def point_cloud(points: bytes, time_ns: int, frame: str = WORLD_FRAME) -> dict[str, Any]:
-    """Return the PointCloud of *points*: x, y, z as little-endian float32, point after point, metres."""
+    """Return a PointCloud message of *points*: x, y, z of each point as little-endian float32, metres."""
     names = ("x", "y", "z")
     return {
         "timestamp": _time(time_ns),
@@ -110,7 +115,7 @@ def point_cloud(points: bytes, time_ns: int, frame: str = WORLD_FRAME) -> dict[s
 
 
 def image(jpeg: bytes, time_ns: int, frame: str = "camera") -> dict[str, Any]:
-    """Return the CompressedImage of a JPEG picture."""
+    """Return a CompressedImage message of a JPEG image; *frame* is the coordinate frame of its camera."""
     return {
         "timestamp": _time(time_ns),
         "frame_id": frame,
@@ -124,7 +129,7 @@ def _time(time_ns: int) -> dict[str, int]:
 
 
 def _quaternion(rotation: tuple[float, ...]) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of a rotation matrix, whose nine numbers are row-major.
+    """Return the quaternion x, y, z, w of a rotation matrix of nine numbers, row-major.
 
     Source:
         Shepperd, Quaternion from rotation matrix, 1978: the largest component is computed first.

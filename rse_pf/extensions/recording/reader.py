@@ -1,8 +1,8 @@
-"""Read a recording: the commands of robots with their answers, in the order in which they were answered.
+"""Read a recording: the commands of robots with their answers, in the order of the answers.
 
-A recording is a file, or a folder of files that are read in the order of their times.  A file that was cut
-off is read up to its last whole chunk.  What is in a file may come from a stranger: sizes are judged before
-anything is decompressed or decoded.  Nothing here solves or writes.
+A recording is a file, or a folder of files that are read in the order of their times.  A truncated file is
+read up to its last complete chunk.  Files are untrusted input: sizes are checked before anything is
+decompressed or decoded.  This module neither solves commands nor writes files.
 """
 
 from __future__ import annotations
@@ -39,26 +39,30 @@ __all__ = [
     "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
 ]  # fmt: skip
 
-"""Metadata record of a file that was exported for one of its commands."""
-
-_MAGIC = b"\x89MCAP0\r\n"
-_MAX_RECORD_BYTES = 64 << 20
+_MAGIC = b"\x89MCAP0\r\n"  # first bytes of an MCAP file
+_MAX_RECORD_BYTES = 64 << 20  # largest MCAP record that is read: bounds the memory for a malformed file
 _MAX_CHUNK_BYTES = 32 << 20
-"""Writers end a chunk at 1 MiB and one message."""
+"""Largest uncompressed size of a chunk that is read.  Writers close a chunk once it exceeds 1 MiB, so that it
+holds at most 1 MiB and one message."""
 _MAX_WAITING = 4096
-"""Commands without an answer that are kept in mind; of more, the oldest count as unanswered."""
-_MAX_CONNECTIONS = 100_000
+"""Largest number of commands that wait for their answers in memory; beyond it the oldest counts as
+unanswered."""
+_MAX_CONNECTIONS = 100_000  # largest number of channels of a file, and of robots with images: bounds memory
 _MAX_STREAMS = 128
-"""Recorders whose files are read at the same time."""
-_KEPT_SIGHTS, _SIGHT_AGE_NS = 32, 500_000_000
-"""Thumbnails and poses of odometry of a robot, and how old the one of a command may be."""
+"""Largest number of recorders whose files are merged by time, which opens a file of each; beyond it all files
+are read one after another."""
+_MAX_KEPT_IMAGES = 32  # number of the newest thumbnails, and of the newest odometry poses, kept for a robot
+_MAX_IMAGE_AGE_NS = 500_000_000  # largest age, ns, of the thumbnail or odometry that belongs to a command
 _DAMAGE = (struct.error, ValueError, OverflowError)
-"""What the library raises for records that are no records, beside its own errors."""
-_COMMAND_ID = re.compile(r"[0-9a-f]{16}:\d{1,16}")
+"""Exceptions that the library `mcap` raises for malformed records, in addition to McapError."""
+_COMMAND_ID = re.compile(r"[0-9a-f]{16}:\d{1,16}")  # ``CONNECTION:ID``
 
 
 class Odometry(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a robot thought it was: ``T_odom_camera`` ``(4, 4)``, at *timestamp_s* of its own clock."""
+    """The odometry pose ``T_odom_camera`` ``(4, 4)``, metres, of a frame.
+
+    ``number`` is the number of the frame, ``timestamp_s`` its time by the robot's clock.
+    """
 
     number: int
     timestamp_s: float
@@ -67,20 +71,23 @@ class Odometry(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedCommand:
-    """One command and its answer, as they were on the wire.
+    """A recorded command and its answer, encoded as they were sent.
 
     Attributes:
-        id: ``CONNECTION:ID``.
-        robot: A pseudonym.
-        tenant: A pseudonym.
-        server: Which server wrote it down, "" where it is not known.
-        codec: ``zlib``, ``json`` or ``bin``.
-        service: Which one was asked.
-        sent_ns: When it was recorded, Unix time, nanoseconds.
-        answered_ns: When its answer was recorded, None if it has none.
-        thumbnail: A small JPEG of the frame, if the robot allowed it.
-        odometry: Of the frame, if the robot recorded it.
-        about: What its file says of itself: ``version``, ``side`` (``server`` or ``robot``), ``engine`` ...
+        id: ``CONNECTION:ID``: the random identifier of the connection, and the id of the command on it.
+        robot: Pseudonym of the robot.
+        tenant: Pseudonym of its tenant.
+        server: Name of the server; "" if it is not known.
+        codec: Codec of the messages: ``zlib``, ``json`` or ``bin``.
+        service: Name of the service that the command asks.
+        sent_ns: Unix time, ns, at which the command was recorded.
+        command_bytes: The message of the command.
+        answered_ns: Unix time, ns, at which the answer was recorded; None without an answer.
+        reply_bytes: The message of the answer; None without an answer.
+        thumbnail: A small JPEG of the camera image; None if none was recorded.
+        odometry: The odometry pose of the frame; None if none was recorded.
+        about: Metadata of the file, such as ``version``, ``side`` (``server`` or ``robot``) and ``engine``.
+        session: Limits of messages that apply when the command or its answer is decoded.
     """
 
     id: str
@@ -100,22 +107,27 @@ class RecordedCommand:
 
     @property
     def sent_s(self) -> float:
-        """When it was recorded, Unix time."""
+        """Unix time at which the command was recorded, seconds."""
         return self.sent_ns / 1e9
 
     @property
     def answered_s(self) -> float | None:
-        """When its answer was recorded, Unix time."""
+        """Unix time at which the answer was recorded, seconds; None without an answer."""
         return None if self.answered_ns is None else self.answered_ns / 1e9
 
     @property
     def round_trip_ms(self) -> float | None:
-        """Time to the answer, as the recording side saw it."""
+        """Time from command to answer on the recording side, ms; None without an answer."""
         return None if self.answered_ns is None else (self.answered_ns - self.sent_ns) / 1e6
 
     @cached_property
     def command(self) -> Command:
-        """The decoded command; raises BadMessage or LimitExceeded."""
+        """The decoded command.
+
+        Raises:
+            BadMessage: The recorded bytes are malformed, or another message than a command.
+            LimitExceeded: The message is larger than the limits allow.
+        """
         message = _codec(self.codec, self.session).decode_from_robot(self.command_bytes)
         if not isinstance(message, Command):
             raise BadMessage("a recorded message is no command", hint="record again")
@@ -123,7 +135,12 @@ class RecordedCommand:
 
     @cached_property
     def reply(self) -> Result | Failure | None:
-        """The decoded answer, None if there is none; raises BadMessage or LimitExceeded."""
+        """The decoded answer; None without an answer.
+
+        Raises:
+            BadMessage: The recorded bytes are malformed, or another message than an answer.
+            LimitExceeded: The message is larger than the limits allow.
+        """
         if self.reply_bytes is None:
             return None
         message = _codec(self.codec, self.session).decode_from_server(self.reply_bytes)
@@ -133,13 +150,14 @@ class RecordedCommand:
 
 
 class WireRecording:
-    """The files of one recording, and what is said about them at their start.
+    """The files of one recording.
 
     Attributes:
-        files: In the order in which they are read.
-        metadata: Of the first file of a server or robot: ``version``, ``side``, ``engine`` ...
-        cut: Files that end within a record, once they have been read.
-        left_out: Messages that could not be decoded, or whose file has more connections than are read.
+        files: The files in the order in which they are read.
+        metadata: Metadata of the first file that a server or robot wrote, such as ``version``, ``side`` and
+            ``engine``; see `read_head`.
+        cut: Truncated or damaged files that `commands` has read so far.
+        left_out: Number of messages that `commands` could not decode so far.
     """
 
     def __init__(self, files: tuple[Path, ...], session: SessionSettings) -> None:
@@ -151,7 +169,12 @@ class WireRecording:
         self._budget = Budget.of_messages(session)
 
     def read_head(self) -> None:
-        """Read what is said before the first message; raises what `commands` raises."""
+        """Read the metadata that precedes the first message of a file, and set `metadata`.
+
+        Raises:
+            BadRequest: The only file is not a recording.
+            UnsupportedProtocol: A file has a newer format.
+        """
         for path in self.files:
             try:
                 head = _head(path)
@@ -166,31 +189,34 @@ class WireRecording:
             self.metadata = self.metadata or about
 
     def commands(self, wanted: Wanted | None = None) -> Iterator[RecordedCommand]:
-        """Yield every command when it was answered, and at the end those without an answer.
+        """Yield each command once its answer is read, and at the end the commands without an answer.
 
-        With *wanted*, parts of finished files that hold nothing of it are not read; commands of other times
-        may be among those that are yielded.
+        *wanted* selects a robot and a time span: chunks of finished files outside the span are not read.
+        Commands of other times may still be yielded, but no other robot's.  None yields all commands.
 
         Raises:
-            BadRequest: A file is no recording.
-            UnsupportedProtocol: It is of a newer version.
+            BadRequest: The only file is not a recording.
+            UnsupportedProtocol: A file has a newer format.
+            LimitExceeded: A chunk is too large, or has an unknown compression.
         """
         self.cut = []
         self.left_out = 0
         waiting: OrderedDict[str, RecordedCommand] = OrderedDict()
-        sights: dict[str, _Sights] = {}
-        for sight in self._merge(wanted):
-            if isinstance(sight.of, file_format.WireChannel):
-                yield from self._pair(sight, sight.of, waiting, sights)
-            elif len(sights) < _MAX_CONNECTIONS:
-                sights.setdefault(sight.of[1], _Sights()).add(sight)
-        yield from (self._with_sights(command, sights) for command in waiting.values())
+        images: dict[str, _RobotImages] = {}
+        for message in self._merge(wanted):
+            if isinstance(message.of, file_format.WireChannel):
+                yield from self._pair(message, message.of, waiting, images)
+            elif len(images) < _MAX_CONNECTIONS:
+                images.setdefault(message.of[1], _RobotImages()).add(message)
+        yield from (self._with_images(command, images) for command in waiting.values())
 
     def find(self, identity: str) -> RecordedCommand:
-        """Return the command ``CONNECTION:ID``, or the only one whose name ends in *identity*.
+        """Return the command with the id *identity*.
+
+        That is ``CONNECTION:ID``, or ``ID`` alone if only one connection has a command with this id.
 
         Raises:
-            BadRequest: There is none, or there are several.
+            BadRequest: No command, or more than one, has this id.
         """
         exact = bool(_COMMAND_ID.fullmatch(identity))
         found: RecordedCommand | None = None
@@ -213,23 +239,30 @@ class WireRecording:
         return found
 
     def _plan_search(self, identity: str) -> Wanted | None:
-        """Return what is read to find a command, None if no summary knows its robot."""
+        """Return the robot that sent the command *identity* as a selection of messages.
+
+        None if no summary of a file names the connection of the command: then everything is read.
+        """
         topic = file_format.wire_topic(identity.partition(":")[0], "up")
         robots = (robot_of(path, topic) for path in self.files)
         robot = next((candidate for candidate in robots if candidate), None)
         return None if robot is None else Wanted(robot=robot)
 
-    def _merge(self, wanted: Wanted | None) -> Iterator[_Sight]:
-        """Yield the messages of all files; those of several recorders by their times."""
+    def _merge(self, wanted: Wanted | None) -> Iterator[_ChannelMessage]:
+        """Yield the messages of all files; the messages of different recorders are merged by time."""
         streams = [list(files) for _, files in itertools.groupby(self.files, key=_recorder)]
         if len(streams) > _MAX_STREAMS:
             streams = [list(self.files)]
         of_file = partial(self._messages, wanted=wanted)
         messages = [itertools.chain.from_iterable(map(of_file, files)) for files in streams]
-        yield from heapq.merge(*messages, key=lambda sight: sight.time_ns)
+        yield from heapq.merge(*messages, key=lambda message: message.time_ns)
 
-    def _messages(self, path: Path, wanted: Wanted | None) -> Iterator[_Sight]:
-        """Yield the messages of one file; in a folder, one that was never begun does not end the others."""
+    def _messages(self, path: Path, wanted: Wanted | None) -> Iterator[_ChannelMessage]:
+        """Yield the messages of one file.
+
+        Raises BadRequest for a file without a valid header, except in a folder of several files, where it
+        only counts as truncated.
+        """
         try:
             yield from _messages(path, self.cut, wanted)
         except BadRequest:
@@ -239,10 +272,10 @@ class WireRecording:
 
     def _pair(
         self,
-        message: _Sight,
+        message: _ChannelMessage,
         channel: file_format.WireChannel,
         waiting: OrderedDict[str, RecordedCommand],
-        sights: dict[str, _Sights],
+        images: dict[str, _RobotImages],
     ) -> Iterator[RecordedCommand]:
         kind, number, service = self._envelope(channel.codec, message.data)
         identity = f"{channel.connection}:{number}"
@@ -256,24 +289,25 @@ class WireRecording:
                 about=message.about, session=self._session,
             )  # fmt: skip
             if len(waiting) > _MAX_WAITING:
-                yield self._with_sights(waiting.popitem(last=False)[1], sights)
+                yield self._with_images(waiting.popitem(last=False)[1], images)
         elif channel.direction == "down" and kind in ("result", "failure") and identity in waiting:
             asked = waiting.pop(identity)
-            yield self._with_sights(
-                replace(asked, answered_ns=message.time_ns, reply_bytes=message.data), sights
+            yield self._with_images(
+                replace(asked, answered_ns=message.time_ns, reply_bytes=message.data), images
             )
         elif channel.direction == "down" and kind == "refused":
             for number, data in self._failures(channel.codec, message.data):
                 refused = waiting.pop(f"{channel.connection}:{number}", None)
                 if refused is not None:
-                    yield self._with_sights(
-                        replace(refused, answered_ns=message.time_ns, reply_bytes=data), sights
+                    yield self._with_images(
+                        replace(refused, answered_ns=message.time_ns, reply_bytes=data), images
                     )
 
     def _failures(self, codec: str, data: bytes) -> list[tuple[int, bytes]]:
-        """Return the id of each command that one message ends, and its own failure as a message.
+        """Return the id of each command that a ``refused`` message answers, with an encoded failure for it.
 
-        Servers before version 0.3.0 could end many commands with one message; recordings of them hold it.
+        Servers before version 0.3.0 refused many commands with one such message, which their recordings hold.
+        Empty if the message cannot be decoded.
         """
         try:
             if codec == "bin":
@@ -289,7 +323,7 @@ class WireRecording:
         return [(number, encode(Failure(id=number, **fields))) for number in dict.fromkeys(refused.ids)]
 
     def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None, str]:
-        """Return the type, the id and the service of a message, "" for one that cannot be read."""
+        """Return type, id and service of a message; ``("", None, "")`` if it cannot be decoded."""
         try:
             if codec == "bin":
                 check_size(data, self._budget)
@@ -305,24 +339,24 @@ class WireRecording:
         return envelope.type, envelope.id, envelope.service
 
     @staticmethod
-    def _with_sights(command: RecordedCommand, sights: dict[str, _Sights]) -> RecordedCommand:
-        seen = sights.get(command.robot)
+    def _with_images(command: RecordedCommand, images: dict[str, _RobotImages]) -> RecordedCommand:
+        seen = images.get(command.robot)
         if seen is None:
             return command
         return _add_images(command, seen.of("frames", command), seen.of("odometry", command))
 
 
 def open_recording(path: Path, session: SessionSettings | None = None) -> WireRecording:
-    """Return the recording at *path*: a file, or a folder with files; nothing but its start is read.
+    """Return the recording at *path*; only the metadata at the start of its files is read.
 
     Args:
-        path: Of a file, or of a folder.
-        session: Limits of messages, None for the defaults.
+        path: Path of a file, or of a folder of files.
+        session: Limits of messages; None for the defaults.
 
     Raises:
-        UsageError: There is no such file, or no recording in the folder.
-        BadRequest: The first file is no recording.
-        UnsupportedProtocol: It is of a newer version.
+        UsageError: The file does not exist, or the folder holds no recording.
+        BadRequest: The file is not a recording.
+        UnsupportedProtocol: A file has a newer format.
     """
     files = recording_files(path)
     recording = WireRecording(files, session or SessionSettings())
@@ -331,11 +365,13 @@ def open_recording(path: Path, session: SessionSettings | None = None) -> WireRe
 
 
 def recording_files(path: Path) -> tuple[Path, ...]:
-    """Return the files of the recording at *path* in their order; a file is opened only for its first bytes.
+    """Return the files of the recording at *path*, by start of the recorder, server and number.
+
+    A single file is opened, and its first bytes are checked; files of a folder are only listed.
 
     Raises:
-        UsageError: There is no such file, or no recording in the folder.
-        BadRequest: A file that is not in a folder of others is no recording.
+        UsageError: The file does not exist, or the folder holds no recording.
+        BadRequest: The file at *path* is empty, or not a recording.
     """
     if path.is_dir():
         files = tuple(sorted(path.glob(f"*{file_format.SUFFIX}"), key=_file_order))
@@ -357,11 +393,15 @@ def recording_files(path: Path) -> tuple[Path, ...]:
     return (path,)
 
 
-# --- files ------------------------------------------------------------------------------------------------
+# --- reading the records of MCAP files ---
 
 
-class _Sight(NamedTuple):
-    """One message of a channel: a connection, or (``frames`` or ``odometry``, pseudonym of the robot)."""
+class _ChannelMessage(NamedTuple):
+    """One message of a file.
+
+    ``of`` says whose it is: a connection, or a pair of ``frames`` (thumbnail) or ``odometry`` and the
+    pseudonym of the robot.  ``time_ns`` is the Unix time, ``about`` the metadata of the file.
+    """
 
     of: file_format.WireChannel | tuple[str, str]
     time_ns: int
@@ -369,26 +409,31 @@ class _Sight(NamedTuple):
     about: Mapping[str, str]
 
 
-class _Sights:
-    """The newest thumbnails and poses of odometry of one robot."""
+class _RobotImages:
+    """The newest 32 thumbnails and the newest 32 odometry poses of one robot."""
 
     def __init__(self) -> None:
-        self._kept: dict[str, deque[_Sight]] = {}
+        self._kept: dict[str, deque[_ChannelMessage]] = {}
 
-    def add(self, sight: _Sight) -> None:
-        self._kept.setdefault(sight.of[0], deque(maxlen=_KEPT_SIGHTS)).append(sight)
+    def add(self, message: _ChannelMessage) -> None:
+        self._kept.setdefault(message.of[0], deque(maxlen=_MAX_KEPT_IMAGES)).append(message)
 
     def of(self, kind: str, command: RecordedCommand) -> bytes | None:
-        """Return the JSON of what belongs to *command*: what names it, else the newest before it."""
-        sights = self._kept.get(kind, ())
+        """Return the JSON of the thumbnail (*kind* ``frames``) or the odometry (``odometry``) of *command*.
+
+        That is the one which names the command, else the newest of the last 0.5 s before it; None without
+        one.
+        """
+        images = self._kept.get(kind, ())
         mark = f'"command":"{command.id}"'.encode()
-        named = next((sight.data for sight in sights if mark in sight.data), None)
+        named = next((message.data for message in images if mark in message.data), None)
         if named is not None:
             return named
         near = [
-            sight
-            for sight in sights
-            if 0 <= command.sent_ns - sight.time_ns <= _SIGHT_AGE_NS and b'"command":' not in sight.data
+            message
+            for message in images
+            if 0 <= command.sent_ns - message.time_ns <= _MAX_IMAGE_AGE_NS
+            and b'"command":' not in message.data
         ]
         return max(near, key=lambda each: each.time_ns).data if near else None
 
@@ -400,7 +445,7 @@ class _Envelope(msgspec.Struct):
 
 
 class _Refused(msgspec.Struct):
-    """A failure of each of its commands, of which one message names at most 64."""
+    """A message of old servers that refuses up to 64 commands with one reason."""
 
     ids: Annotated[list[Identifier], msgspec.Meta(max_length=64)]
     code: str
@@ -432,7 +477,7 @@ def _codec(name: str, session: SessionSettings) -> Codec:
 
 
 def _add_images(command: RecordedCommand, image: bytes | None, pose: bytes | None) -> RecordedCommand:
-    """Return *command* with what was seen; what cannot be read is left out."""
+    """Return *command* with thumbnail and odometry from their JSON; malformed ones are left out."""
     thumbnail = None
     odometry = None
     try:
@@ -457,13 +502,13 @@ def _file_order(path: Path) -> tuple[str, str, int]:
 
 
 def _recorder(path: Path) -> tuple[str, str]:
-    """Return what is the same for the files that one recorder wrote one after the other."""
+    """Return a key that is equal for all files that one recorder wrote."""
     name = file_format.FileName.parse(path.name)
     return ("", path.name) if name is None else (name.started.isoformat(), name.server)
 
 
 def _head(path: Path) -> dict[str, dict[str, str]]:
-    """Return the metadata of a file by name."""
+    """Return the metadata records before the first message of a file, by name."""
     from mcap.records import Chunk, Message, Metadata
 
     metadata_by_name = {}
@@ -475,8 +520,11 @@ def _head(path: Path) -> dict[str, dict[str, str]]:
     return metadata_by_name
 
 
-def _messages(path: Path, cut: list[Path], wanted: Wanted | None) -> Iterator[_Sight]:
-    """Yield the messages of connections, thumbnails and odometry of one file."""
+def _messages(path: Path, cut: list[Path], wanted: Wanted | None) -> Iterator[_ChannelMessage]:
+    """Yield the messages of connections, thumbnails and odometry of one file that *wanted* selects.
+
+    A truncated or damaged file is appended to *cut*.
+    """
     from mcap.records import Channel, Message, Metadata
 
     about: Mapping[str, str] = {}
@@ -494,7 +542,7 @@ def _messages(path: Path, cut: list[Path], wanted: Wanted | None) -> Iterator[_S
         if isinstance(record, Message):
             of = channels.get(record.channel_id)
             if of is not None:
-                yield _Sight(of, record.log_time, record.data, about)
+                yield _ChannelMessage(of, record.log_time, record.data, about)
         elif isinstance(record, Channel):
             add(record.id, record.topic, record.metadata)
         elif isinstance(record, Metadata) and record.name == file_format.METADATA_NAME:
@@ -514,7 +562,10 @@ def _channel(topic: str, metadata: dict[str, str]) -> file_format.WireChannel | 
 
 
 def _flat(path: Path, cut: list[Path], plan: ChunkPlan | None) -> Iterator[Any]:
-    """Yield the records of a file, those in its chunks of *plan* included, up to where it is cut off."""
+    """Yield the records of a file and of those of its chunks that *plan* selects (None for all).
+
+    Reading ends at the first damaged record, and the file is then appended to *cut*.
+    """
     from mcap.exceptions import McapError
     from mcap.records import Chunk
     from mcap.stream_reader import breakup_chunk
@@ -537,7 +588,12 @@ def _flat(path: Path, cut: list[Path], plan: ChunkPlan | None) -> Iterator[Any]:
 
 
 def _decompress(chunk: Any) -> bytes:
-    """Return the content of a chunk; raises ValueError if it is damaged, or longer than it may be."""
+    """Return the uncompressed records of a chunk.
+
+    Raises:
+        ValueError: The chunk is damaged.
+        LimitExceeded: It is too large, or has an unknown compression.
+    """
     size: int = chunk.uncompressed_size
     if size > _MAX_CHUNK_BYTES:
         raise LimitExceeded(
@@ -564,11 +620,13 @@ def _decompress(chunk: Any) -> bytes:
 
 
 def _records(path: Path, cut: list[Path]) -> Iterator[Any]:
-    """Yield the records of a file with whole chunks; a file that ends within one ends there, too.
+    """Yield the records of a file without opening its chunks, up to the footer.
+
+    Reading ends at the first truncated or damaged record, and the file is then appended to *cut*.
 
     Raises:
-        BadRequest: It is no recording.
-        UnsupportedProtocol: It is of a newer version.
+        BadRequest: The file is empty, or not a recording.
+        UnsupportedProtocol: The file has a newer format.
     """
     from mcap.exceptions import McapError
     from mcap.records import Footer, Header, Metadata
@@ -599,7 +657,10 @@ def _records(path: Path, cut: list[Path]) -> Iterator[Any]:
 
 
 class _Bounded:
-    """A file whose reads ask for no more memory than the file has bytes."""
+    """A file that is read with at most as many bytes at a time as remain in it.
+
+    The length of a malformed record may be huge; a plain read would allocate that much memory.
+    """
 
     def __init__(self, file: Any) -> None:
         self._file = file

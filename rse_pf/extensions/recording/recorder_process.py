@@ -1,7 +1,7 @@
-"""The recorder of one server: reads what workers deliver, and writes it to files.
+"""The recorder process of a server: reads messages from the pipes of the workers, and writes them to files.
 
-It ends when no worker is left, after it finished its file.  It has a lower priority than the workers: robots
-come first, and what it cannot keep up with is dropped in the workers and counted.
+The process finishes its file and exits when no worker is left.  It has a lower priority than the workers; if
+it cannot keep up, the workers drop and count messages.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from rse_pf.extensions.recording.file_format import (
 from rse_pf.extensions.recording.poses import inverse, pose_in_frame, read_answered_pose
 from rse_pf.extensions.recording.redact import KEY_BYTES, ConnectionRedactor, Kept, Pseudonyms
 from rse_pf.extensions.recording.tap import (
+    ANSWER_WITH_POSE,
     CLOSED,
+    DECODED_COMMAND,
     DOWN,
     LOST,
     OPENED,
-    PLAIN,
-    POSE,
     UP,
-    Handed,
+    PipeEntry,
     PipeReader,
-    plain_parts,
-    pose_parts,
+    split_answer_with_pose,
+    split_decoded_command,
 )
 from rse_pf.extensions.recording.writer import RecordingWriter
 from rse_pf.identity import RobotId
@@ -58,26 +58,34 @@ __all__ = [
 ]  # fmt: skip
 
 _READ_BYTES = 1 << 15
-"""Read at a time: half a millisecond of work, after which a robot's command may have the processor."""
-_GATHER_S = 0.1
-"""To be woken and to find cold caches costs more than what a few messages do."""
-_FLUSH_S = 0.2
-_MOST_FDS = 4
+"""Largest number of bytes that are read at a time: half a millisecond of work, after which the process yields
+the processor to a worker."""
+_READ_INTERVAL_S = 0.1
+"""Pause, seconds, after the pipes were read empty: waking up for each message costs more than its work."""
+_FLUSH_INTERVAL_S = 0.2  # longest time, seconds, between two calls of `RecordingWriter.flush`
+_MAX_FDS = 4  # largest number of file descriptors that are received with one message
 _CHILD = ChildPlan(
     target=f"{__name__}:run", name="rse-pf recorder", policy="batch", nice=5, outlives_parent=True
 )
-_TOLD = frozenset({PLAIN, POSE})
-_HEX_BYTES = 8
+_DECODED_KINDS = frozenset({DECODED_COMMAND, ANSWER_WITH_POSE})  # kinds with decoded contents
+_HEX_BYTES = 8  # random bytes of the identifier of a connection, 16 hex digits
 
 
 class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recorder process is told at its start.
+    """The configuration of a recorder process.
 
     Attributes:
-        started_ns: When the server's first recorder was started, Unix time.
-        from_workers: Socket from which it takes its ends of the workers' pipes, until no worker is left.
-        restarts: How many recorders of this server ended before.
-        key: File of the key of the pseudonyms, "" for the one that it is told with the plan.
+        folder: Folder for the files.
+        server: Name of the server.
+        version: Version of the software.
+        started_ns: Unix time, ns, at which the first recorder of the server was started.
+        from_workers: Descriptor of the socket from which the recorder receives its ends of the workers'
+            pipes, until no worker is left.
+        restarts: Number of recorders of this server that exited before.
+        max_bytes: Size of all recordings in the folder, bytes, above which the oldest ones are deleted.
+        session: Limits of messages, the fields of `SessionSettings`.
+        metadata: Further values for the metadata record of each file.
+        key: File with the key of the pseudonyms; "" for the key that is sent with this plan.
     """
 
     folder: str
@@ -93,7 +101,7 @@ class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecordedConnection:
-    """One connection of a recording: its channels, and what may be stored of its messages."""
+    """A connection of a recording: its redactor, its random identifier, and its channels by direction."""
 
     def __init__(self, redactor: ConnectionRedactor, *, identity: str, codec: str, server: str) -> None:
         self.redactor = redactor
@@ -103,28 +111,28 @@ class RecordedConnection:
         self.channels: dict[Direction, int] = {}
 
     def wire_channel(self, direction: Direction) -> WireChannel:
-        """Return what the channel of one direction says."""
+        """Return the description of the channel for one direction."""
         return WireChannel(
             self.identity, direction, self.codec, self.server, self.redactor.robot, self.redactor.tenant
         )
 
 
 class MessageRecorder:
-    """Writes messages of connections, and the poses that they tell, by a `RecordingWriter`."""
+    """Write the messages of connections, and the poses in the answers, with a `RecordingWriter`."""
 
     def __init__(
         self, writer: RecordingWriter, pseudonyms: Pseudonyms, session: SessionSettings, server: str
     ) -> None:
         self.writer = writer
         self.left_out = 0
-        """Messages that a recording does not hold by design."""
+        """Number of messages that were left out by `ConnectionRedactor`."""
         self._pseudonyms = pseudonyms
         self._session = session
         self._server = server
         self._codecs: dict[str, Any] = {}
 
     def open(self, codec: str, robot: RobotId, secrets_: tuple[str, ...] = ()) -> RecordedConnection:
-        """Return a new connection of *robot*; no message that holds one of *secrets_* is stored."""
+        """Return a new connection of *robot*; messages that contain one of *secrets_* are not recorded."""
         if codec not in self._codecs:
             self._codecs[codec] = make_codec(codec, self._session)
         redactor = ConnectionRedactor(
@@ -135,7 +143,7 @@ class MessageRecorder:
         return RecordedConnection(redactor, identity=identity, codec=codec, server=self._server)
 
     def take(self, connection: RecordedConnection, direction: Direction, time_ns: int, data: bytes) -> None:
-        """Write a message, unless it is one of those that are left out."""
+        """Write a message unless the redactor leaves it out, and the pose of a `pnp` result."""
         redactor = connection.redactor
         stored = redactor.up(data) if direction == "up" else redactor.down(data)
         self._write(connection, direction, time_ns, stored)
@@ -144,14 +152,16 @@ class MessageRecorder:
                 connection, time_ns, read_answered_pose(stored.text, is_binary=connection.codec == "bin")
             )
 
-    def take_plain(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
-        """Write a command that its server has read, the data of a ``PLAIN`` entry."""
-        self._write(connection, "up", time_ns, connection.redactor.plain(*plain_parts(data)))
+    def record_decoded_command(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
+        """Write the command in *data*, the data of a ``DECODED_COMMAND`` entry."""
+        self._write(
+            connection, "up", time_ns, connection.redactor.decoded_command(*split_decoded_command(data))
+        )
 
-    def take_pose(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
-        """Write an answer whose pose its server told, the data of a ``POSE`` entry."""
-        identity, pose, message = pose_parts(data)
-        stored = connection.redactor.pose(identity, message)
+    def record_answer_with_pose(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
+        """Write the answer and the pose in *data*, the data of an ``ANSWER_WITH_POSE`` entry."""
+        identity, pose, message = split_answer_with_pose(data)
+        stored = connection.redactor.answer_with_pose(identity, message)
         self._write(connection, "down", time_ns, stored)
         if stored is not None:
             self._add_pose(connection, time_ns, pose)
@@ -171,12 +181,12 @@ class MessageRecorder:
         self.writer.add(channel, time_ns, stored.data)
 
     def close(self, connection: RecordedConnection) -> None:
-        """Take that a connection is over."""
+        """Remove the channels of a connection after its last message."""
         for channel in connection.channels.values():
             self.writer.forget(channel)
 
     def event(self, time_ns: int, kind: str, **fields: Any) -> None:
-        """Write an event of the recording itself."""
+        """Write an event about the recording, such as ``recording-started``, to the channel of events."""
         value = {"time_s": time_ns / 1e9, "kind": kind, "server": self._server, **fields}
         self.writer.add_json(EVENTS_TOPIC, EVENT_SCHEMA, time_ns, value)
 
@@ -190,29 +200,33 @@ class MessageRecorder:
 
 
 class PipeRecorder:
-    """Records what comes out of the pipe of one worker."""
+    """Record the entries from the pipe of one worker."""
 
     def __init__(self, recorder: MessageRecorder) -> None:
-        """Know no connection yet."""
+        """Start without connections."""
         self._recorder = recorder
         self._reader = PipeReader()
         self._connections: dict[int, RecordedConnection] = {}
         self._lost = 0
 
     def read(self, data: bytes) -> None:
-        """Take the next bytes of the pipe."""
+        """Record the entries that are complete after *data*, the next bytes of the pipe."""
         for entry in self._reader.entries(data):
             self._take(entry)
 
     def end(self) -> None:
-        """Take that the worker is gone."""
+        """Close all connections of the worker, which has exited."""
         for connection in self._connections.values():
             self._recorder.close(connection)
 
-    def _take(self, entry: Handed) -> None:
-        if entry.kind in _TOLD:
+    def _take(self, entry: PipeEntry) -> None:
+        if entry.kind in _DECODED_KINDS:
             connection = self._connections.get(entry.connection)
-            take = self._recorder.take_plain if entry.kind == PLAIN else self._recorder.take_pose
+            take = (
+                self._recorder.record_decoded_command
+                if entry.kind == DECODED_COMMAND
+                else self._recorder.record_answer_with_pose
+            )
             if connection is not None:
                 take(connection, entry.time_ns, entry.data)
         elif entry.kind == OPENED:
@@ -234,25 +248,25 @@ class PipeRecorder:
 
 
 def start_recorder(plan: RecorderPlan, key: bytes) -> Child:
-    """Return the process of a new recorder with the key of its pseudonyms; raises OSError.
+    """Start a recorder process with *plan* and the random *key* of its pseudonyms; raises OSError.
 
-    Its log lines go where those of this process go.
+    Its log lines go to the standard error of this process.
     """
     child = start_child(_CHILD, descriptors=(plan.from_workers,))
     child.say([msgspec.to_builtins(plan), key])
-    child.connection.close()  # workers are forked from this process, and would have it
+    child.connection.close()  # otherwise workers, which are forked from this process, would inherit it
     return child
 
 
 def run(server: socket.socket) -> None:
-    """Record until no worker is left."""
+    """Run the recorder process until no worker is left; its plan and key are received from *server*."""
     with server:
         order = receive(server)
     if order is None:
         return
     plan, key = msgspec.convert(order[0], RecorderPlan), order[1]
     session = SessionSettings(**plan.session)
-    with suppress(OSError):  # the writer says why it cannot write
+    with suppress(OSError):  # the writer reports why it cannot write
         Path(plan.folder).mkdir(parents=True, exist_ok=True)
     writer = RecordingWriter(
         Path(plan.folder), plan.server, started_ns=plan.started_ns,
@@ -278,11 +292,11 @@ def _loop(
     plan: RecorderPlan,
 ) -> None:
     writer, problem = recorder.writer, ""
-    buffer = bytearray(_READ_BYTES)  # a new one for each read would cost more than what it holds
+    buffer = bytearray(_READ_BYTES)  # one buffer for all reads: allocating it costs more than a message
     view = memoryview(buffer)
     while selector.get_map():
         has_more = False
-        for key, _ in selector.select(_FLUSH_S):
+        for key, _ in selector.select(_FLUSH_INTERVAL_S):
             if key.fileobj is from_workers:
                 _take_pipes(selector, from_workers, recorder)
                 continue
@@ -303,15 +317,18 @@ def _loop(
             problem = writer.problem
             _log(plan.server, problem, writer.dropped)
         if not has_more:
-            time.sleep(_GATHER_S)
+            time.sleep(_READ_INTERVAL_S)
 
 
 def _take_pipes(
     selector: selectors.BaseSelector, from_workers: socket.socket, recorder: MessageRecorder
 ) -> None:
-    """Take the ends of pipes that workers sent; leave *selector* once there is no worker any more."""
+    """Receive ends of pipes from workers, and read them from now on.
+
+    Once no worker has the other end of *from_workers*, this socket is removed from *selector*.
+    """
     try:
-        data, fds, _, _ = socket.recv_fds(from_workers, 1, _MOST_FDS)
+        data, fds, _, _ = socket.recv_fds(from_workers, 1, _MAX_FDS)
     except BlockingIOError:
         return
     except OSError:
@@ -323,7 +340,10 @@ def _take_pipes(
 
 
 def _log(server: str, problem: str, dropped: int) -> None:
-    """Write a log line about the disk, as a server writes its own."""
+    """Write a log line in the format of a server: recording stopped by *problem*, or resumed for "".
+
+    *dropped* is the number of messages that were dropped so far.
+    """
     line: dict[str, Any] = {"time": time.time(), "level": "warning", "event": "recording-resumed"}
     line |= {"server": server, "dropped": dropped}
     if problem:
@@ -333,11 +353,11 @@ def _log(server: str, problem: str, dropped: int) -> None:
         os.write(2, json.dumps(line).encode() + b"\n")
 
 
-def _key(file: str, told: bytes) -> bytes:
-    """Return the key of the pseudonyms of this recording: that of *file*, or the one that was *told*."""
+def _key(file: str, default: bytes) -> bytes:
+    """Return the key of the pseudonyms from *file*; *default* if "" or if the file has no valid key."""
     if file:
         with suppress(OSError):
             key = Path(file).read_bytes()
             if len(key) >= KEY_BYTES:
                 return key
-    return told
+    return default

@@ -1,9 +1,10 @@
-"""Decide which messages a recording holds, and take names out of them; tokens are never in one.
+"""Select the messages that are recorded, and replace names in them by pseudonyms; tokens are never recorded.
 
-Stored are commands of services whose messages have no place for a name, what answers them, and the messages
-that keep a connection alive.  Everything else, such as a renewal, an update or what cannot be decoded, is
-left out, and so is any message that holds a token or another secret.  A free text that holds the name of the
-robot or of its tenant is rewritten; all other messages stay as they were, to the byte.
+Recorded are the commands of services whose requests have no field for a name, their answers, and the messages
+that open and keep a connection.  All others, such as renewals of tokens, updates, and messages that cannot be
+decoded, are left out, and so is every message that contains a token or another secret.  If a free text
+contains the name of the robot or of its tenant, the message is encoded again with a pseudonym; all other
+messages are recorded byte by byte.
 """
 
 from __future__ import annotations
@@ -28,29 +29,32 @@ __all__ = ["NAME_FREE_SERVICES", "ConnectionRedactor", "Kept", "Pseudonyms"]
 
 NAME_FREE_SERVICES = frozenset({"pnp", "icp"})
 """Services whose requests and replies have no field for a name."""
-KEY_BYTES = 32
-_DIGITS = 8
-_MAX_OPEN = 4096
+KEY_BYTES = 32  # smallest size of the key of the pseudonyms
+_PSEUDONYM_DIGITS = 8  # number of hex digits of a pseudonym
+# Largest number of commands of a connection whose answers are awaited: bounds the memory.
+_MAX_OPEN_COMMANDS = 4096
+# Types of messages from robots, apart from commands, that are recorded.
 _ALWAYS_UP = frozenset({"hello", "ping", "cancel"})
+# Types of messages from servers that are recorded although they answer no command.
 _ALWAYS_DOWN = frozenset({"move", "pong", "renewed"})
-_TEXT_FIELDS = ("trace", "stream", "message", "hint", "what", "reason", "sdk")
-_VALUE_FIELDS = ("payload", "reply")
+_TEXT_FIELDS = ("trace", "stream", "message", "hint", "what", "reason", "sdk")  # fields with free texts
+_VALUE_FIELDS = ("payload", "reply")  # fields with values of a service, in which `PROTOCOL_WORDS` stay
 PROTOCOL_WORDS = frozenset({
     "camera", "points_world", "pixels", "options", "depths_m", "depth_noise", "T_camera_world", "inliers",
     "rmse_px", "covariance", "verdict", "reason", "engine", "native", "opencv", "ok", "weak",
     "target", "source", "T_target_source", "overlap", "iterations",
 })  # fmt: skip
-"""Words of requests and replies: a robot that has one for a name is not looked for in them."""
-_TOKEN_START = b"eyJ"
+"""Words of requests and replies that are not replaced there, even if a robot has one of them as its name."""
+_TOKEN_START = b"eyJ"  # the first bytes of every JSON Web Token
 _TOKEN = re.compile(rb"eyJ[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}")
-"""A JSON Web Token, wherever a robot put it."""
+"""Pattern of a JSON Web Token; a message that contains one is left out."""
 _RESULT = re.compile(rb'\{"type":"result","id":([1-9][0-9]{0,15}|0),"reply":')
-"""How a server's answer begins; its other fields need not be read."""
+"""Start of a result in JSON as servers write it, with the id of the command: saves decoding the message."""
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, RsePfError)
 
 
 class _Head(msgspec.Struct, frozen=True):
-    """What every message says of itself."""
+    """The fields of a message that decide whether it is recorded."""
 
     type: str
     id: int | None = None
@@ -62,13 +66,13 @@ _binary_head = msgspec.msgpack.Decoder(_Head).decode
 
 
 class Kept(NamedTuple):
-    """A message of a recording.
+    """A message as it is recorded.
 
     Attributes:
-        data: As it was on the wire, unless a name was taken out.
-        text: The same inflated, for the codec ``zlib``.
-        type: Of the message, such as ``result``.
-        service: Of the command, or of the command that it answers; "" where there is none.
+        data: The encoded message, with pseudonyms for names.
+        text: The message before it was deflated; empty if it was not inflated here.
+        type: Type of the message, such as ``result``.
+        service: Service of the command, or of the command that the message answers; "" if there is none.
     """
 
     data: bytes
@@ -78,26 +82,29 @@ class Kept(NamedTuple):
 
 
 class Pseudonyms:
-    """Stable names for robots and tenants within one recording, which nobody can trace back to them."""
+    """Pseudonyms of robots and tenants: the same within one recording, and not invertible without the key."""
 
     def __init__(self, key: bytes) -> None:
-        """Keep *key*: random, never written anywhere."""
+        """Take the random key, which is never recorded."""
         self._key = key
 
     def robot(self, robot: RobotId) -> str:
-        """Return ``robot-XXXXXXXX``."""
+        """Return the pseudonym of a robot, ``robot-XXXXXXXX``."""
         return f"robot-{self._digest(robot.folder)}"
 
     def tenant(self, tenant: str) -> str:
-        """Return ``tenant-XXXXXXXX``."""
+        """Return the pseudonym of a tenant, ``tenant-XXXXXXXX``."""
         return f"tenant-{self._digest(f'tenant {tenant}')}"
 
     def _digest(self, text: str) -> str:
-        return hmac.new(self._key, text.encode(), hashlib.sha256).hexdigest()[:_DIGITS]
+        return hmac.new(self._key, text.encode(), hashlib.sha256).hexdigest()[:_PSEUDONYM_DIGITS]
 
 
 class ConnectionRedactor:
-    """Judges the messages of one connection, in the order in which they were taken."""
+    """Select and redact the messages of one connection, which it gets in the order of time.
+
+    ``left_out`` counts the messages that are not recorded.
+    """
 
     def __init__(
         self,
@@ -108,14 +115,14 @@ class ConnectionRedactor:
         max_inflated_bytes: int,
         secrets: Iterable[str] = (),
     ) -> None:
-        """Know what must not be in the recording.
+        """Prepare to redact.
 
         Args:
-            codec: Of the connection.
-            robot: Who is connected.
-            pseudonyms: What stands for its names.
-            max_inflated_bytes: A message that is longer, inflated, is left out.
-            secrets: Further texts that no message may hold; one that does is left out.
+            codec: Codec of the connection.
+            robot: The connected robot, whose name and tenant are replaced.
+            pseudonyms: The pseudonyms that replace them.
+            max_inflated_bytes: Largest size of an inflated message; a larger one is left out.
+            secrets: Texts such as the token of the robot; a message that contains one is left out.
         """
         self.robot = pseudonyms.robot(robot)
         self.tenant = pseudonyms.tenant(robot.tenant)
@@ -138,7 +145,7 @@ class ConnectionRedactor:
         self._open: OrderedDict[int, str] = OrderedDict()
 
     def up(self, data: bytes) -> Kept | None:
-        """Return what is stored of a message of the robot, None if it is left out."""
+        """Return a message of the robot as it is recorded; None if it is left out."""
         try:
             text = self._inflate(data)
             message = peek(self._text_codec, text)
@@ -156,13 +163,13 @@ class ConnectionRedactor:
             return self._leave_out()
         return stored or self._leave_out()
 
-    def plain(self, identity: int, words: bytes, data: bytes) -> Kept | None:
-        """Return what is stored of a `pnp` command that its server has read already.
+    def decoded_command(self, identity: int, words: bytes, data: bytes) -> Kept | None:
+        """Return a `pnp` command, whose texts the server has decoded, as it is recorded; None if left out.
 
         Args:
-            identity: Of the command.
-            words: All its texts that the protocol does not fix; the rest of it is numbers in known fields.
-            data: As on the wire; it is inflated only if the words hold a name or a token.
+            identity: Id of the command.
+            words: All free texts of the command; the rest of it is numbers in known fields.
+            data: The message; it is inflated only if the texts may contain a name or a token.
         """
         text = words if self._is_text else words + data
         if self._is_clean(text):
@@ -170,13 +177,16 @@ class ConnectionRedactor:
             return Kept(data, b"", "command", "pnp")
         return self.up(data)
 
-    def pose(self, identity: int, data: bytes) -> Kept | None:
-        """Return what is stored of the answer to command *identity*, in which no text is a robot's."""
+    def answer_with_pose(self, identity: int, data: bytes) -> Kept | None:
+        """Return the answer to the command *identity*, which contains no texts of a robot, unchanged.
+
+        None if that command was not recorded.
+        """
         service = self._open.pop(identity, "")
         return Kept(data, b"", "result", service) if service else self._leave_out()
 
     def down(self, data: bytes) -> Kept | None:
-        """Return what is stored of a message of the server, None if it is left out."""
+        """Return a message of the server as it is recorded; None if it is left out."""
         try:
             text = self._inflate(data)
             match = _RESULT.match(text) if self._is_text else None
@@ -203,11 +213,14 @@ class ConnectionRedactor:
 
     def _remember(self, identity: int, service: str) -> None:
         self._open[identity] = service
-        if len(self._open) > _MAX_OPEN:  # of a robot that sends more than it may
+        if len(self._open) > _MAX_OPEN_COMMANDS:  # the robot exceeds the limits of the protocol
             self._open.popitem(last=False)
 
     def _inflate(self, data: bytes) -> bytes:
-        """Return the text of a message; raises ValueError if it is too long or damaged."""
+        """Inflate a message of the codec ``zlib``; return others unchanged.
+
+        Raises ValueError if the message is malformed, or larger than the limit.
+        """
         if not self._inflates:
             return data
         stream = zlib.decompressobj()
@@ -236,13 +249,16 @@ class ConnectionRedactor:
             after = self._replace(before, PROTOCOL_WORDS if name in _VALUE_FIELDS else frozenset())
             if after is not before:
                 changes[name] = after
-        if not changes:  # by chance, in a number or a word of the protocol
+        if not changes:  # the match was a part of a number or of a word of the protocol
             return Kept(data, text, kind, service)
         changed = self._codec.encode(msgspec.structs.replace(message, **changes))
         return Kept(changed, self._inflate(changed), kind, service)
 
     def _replace(self, value: Any, spared: frozenset[str]) -> Any:
-        """Return *value* with pseudonyms for names but for *spared* words; the same object if it has none."""
+        """Replace names by pseudonyms in the strings of *value*, but not in strings of *spared*.
+
+        The same object is returned if nothing was replaced.
+        """
         if isinstance(value, str):
             if self._in_text is None or value in spared:
                 return value
@@ -261,7 +277,7 @@ class ConnectionRedactor:
         return self._names[match.group()]
 
     def _is_clean(self, text: bytes) -> bool:
-        """Return whether *text* has nothing that might be a token, a secret or a name."""
+        """Return whether *text* contains neither the start of a token, nor a secret, nor a name."""
         for mark in self._marks:  # noqa: SIM110  a generator costs more than the search
             if mark in text:
                 return False
@@ -280,10 +296,10 @@ class ConnectionRedactor:
 
 
 def _spellings(name: str) -> set[str]:
-    """Return *name* as MessagePack and JSON write it."""
+    """Return the spellings of *name* in MessagePack and in JSON, with and without escapes."""
     return {name, json.dumps(name)[1:-1], json.dumps(name, ensure_ascii=False)[1:-1]}
 
 
 def _either(names: Iterable[str]) -> str:
-    """Return a pattern of any of *names* as a whole word."""
+    """Return a regular expression that matches any of *names* as a whole word."""
     return f"(?<![A-Za-z0-9_])(?:{'|'.join(map(re.escape, names))})(?![A-Za-z0-9_])"

@@ -43,14 +43,14 @@ from rse_pf.wire import PROTOCOL_VERSION, Codec, Welcome
 __all__ = ["RobotRecorder"]
 
 MAX_QUEUED_ENTRIES = 2000
-"""Most entries that wait for the thread, so that a slow disk does not fill the memory of the robot."""
+"""Largest number of entries that wait for the thread: bounds the memory when the disk is slow."""
 FLUSH_INTERVAL_S = 0.2
-"""Longest time between two flushes of the file, so that a crash loses little of the recording."""
+"""Longest time, seconds, between two calls of `RecordingWriter.flush`: a crash then loses little."""
 STOP_TIMEOUT_S = 5.0
-"""How long `RobotRecorder.stop` waits until the thread has written the queued entries, in seconds."""
+"""Longest time, seconds, that `RobotRecorder.stop` waits until the thread has written the queued entries."""
 MAX_MESSAGES_BEFORE_WELCOME = 16
 """Messages of a connection that are kept until its Welcome names the robot; further ones are not recorded."""
-THUMBNAIL_WIDTH_PX = 160
+THUMBNAIL_WIDTH_PX = 160  # largest width of a recorded thumbnail
 JPEG_QUALITY = 70
 """Quality of thumbnails (0..95 of Pillow): small files in which people still recognise the scene."""
 MAX_MAP_POINTS = 100_000
@@ -75,7 +75,7 @@ class _CloseEntry(NamedTuple):
 
 
 class _FrameEntry(NamedTuple):
-    """A frame: its number, its time by the robot, a small picture, and its pose by odometry, row by row."""
+    """A frame: Unix time (ns), number, time by the robot's clock, small image, odometry pose (row-major)."""
 
     time_ns: int
     number: int
@@ -93,7 +93,10 @@ _Entry = _MessageEntry | _OpenEntry | _CloseEntry | _FrameEntry | _MapEntry
 
 
 class _Connection:
-    """Hold the messages of a connection until its Welcome names the robot, and its recording from then on."""
+    """A connection: its messages until a Welcome names the robot, and its channels in the file from then on.
+
+    ``recorded`` is None until that Welcome.
+    """
 
     def __init__(self, entry: _OpenEntry) -> None:
         self.codec = entry.codec
@@ -111,13 +114,13 @@ class RobotRecorder:
         """Describe the recording; `start` begins it.
 
         Args:
-            folder: For the files; made if it is missing.
-            thumbnails: Whether pictures of frames are recorded, at most 160 px wide.
+            folder: Folder for the files, which is created if it is missing.
+            thumbnails: Whether images of frames are recorded, at most 160 px wide.
             session: Limits of messages.
             version: Version of the robot's software, which is written into the recording.
         """
         self.dropped = 0
-        """Messages and frames that were not recorded, because the disk is too slow."""
+        """Number of messages, frames and maps that were not recorded because the queue was full."""
         self.thumbnails = thumbnails
         self._folder = Path(folder)
         self._session = session
@@ -143,7 +146,7 @@ class RobotRecorder:
         self._thread.start()
 
     async def stop(self) -> None:
-        """Write the queued entries and finish the file, within five seconds."""
+        """Write the queued entries and finish the file; give up after five seconds."""
         thread, self._thread = self._thread, None
         if thread is not None:
             await asyncio.to_thread(self._finish, thread)
@@ -153,7 +156,7 @@ class RobotRecorder:
         thread.join(STOP_TIMEOUT_S)
 
     def open_connection(self, codec: Codec, token: str | None) -> int:
-        """Return the number of a new connection; no message that holds *token* will be recorded."""
+        """Return the number of a new connection; messages that contain *token* are not recorded."""
         self._connections += 1
         self._enqueue(_OpenEntry(self._connections, codec, token or ""))
         return self._connections
@@ -172,7 +175,7 @@ class RobotRecorder:
         rgb: npt.NDArray[np.uint8] | None = None,
         T_odom_camera: npt.NDArray[np.float64] | None = None,
     ) -> None:
-        """Record a frame.
+        """Record a frame; one without thumbnail and odometry is only counted.
 
         Args:
             timestamp_s: Time of the frame by the robot's clock.

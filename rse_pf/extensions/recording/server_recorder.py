@@ -1,6 +1,6 @@
-"""Record one server: start the recorder process, which exits after the last worker, and restart it.
+"""Start the recorder process of a server, restart it after a crash, and connect workers to it.
 
-A server serves robots whether it can record or not.
+The recorder exits after the last worker.  A server that cannot record serves robots all the same.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import msgspec
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.recording.recorder_process import RecorderPlan, start_recorder
 from rse_pf.extensions.recording.redact import KEY_BYTES
-from rse_pf.extensions.recording.tap import RecordingTap, hand_pipe
+from rse_pf.extensions.recording.tap import RecordingTap, send_pipe
 from rse_pf.processes.start import Child
 from rse_pf.server.worker_context import Log, MessageTap, NullMessageTap
 from rse_pf.version import installed_version
@@ -30,16 +30,18 @@ from rse_pf.wire import PROTOCOL_VERSION
 
 __all__ = ["FileServerRecorder"]
 
-_FINISH_S = 3.0
-"""Time that the recorder has to finish its file when the workers are gone."""
-_MOST_RESTARTS, _WITHIN_S = 5, 600.0
+_FINISH_TIMEOUT_S = 3.0
+"""Longest time, seconds, that a server waits for the recorder to finish its file after the last worker."""
+_MAX_RESTARTS = 5  # restarts of a recorder within `_RESTART_WINDOW_S` after which recording is given up
+_RESTART_WINDOW_S = 600.0  # time, seconds, in which restarts of a recorder are counted
 
 
 class FileServerRecorder:
-    """Record one server in files, inside of ``with``; a `rse_pf.server.worker_context.ServerRecorder`.
+    """Record one server in files within ``with``; implements `rse_pf.server.worker_context.ServerRecorder`.
 
-    A recorder process that exits although there are workers is started again, up to five times in ten
-    minutes.  Workers send it the ends of their pipes by the socket ``to_recorder``.
+    A recorder process that exits while there are workers is restarted, up to five times in ten minutes.
+    Workers send the recorder the other ends of their pipes over the socket ``to_recorder``; ``pids`` holds
+    the id of the recorder process, or nothing once recording was given up.
     """
 
     def __init__(
@@ -52,15 +54,15 @@ class FileServerRecorder:
         restart_s: float = 0.5,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start nothing yet.
+        """Prepare to record; ``with`` starts the recorder.
 
         Args:
-            settings: Of the server; ``recording.folder`` is set.
-            server: Its name.
-            key: File of the key of pseudonyms, None for a key of its own.
-            start: Starts a recorder with its key.
-            restart_s: Delay of the first restart; each one doubles it.
-            clock: Seconds of restarts.
+            settings: Settings of the server, with ``recording.folder``.
+            server: Name of the server.
+            key: File with the key of the pseudonyms; None for a random key.
+            start: Starts a recorder process with a plan and a key.
+            restart_s: Delay of the first restart, seconds; each further one in ten minutes doubles it.
+            clock: Monotonic clock, seconds.
         """
         self._key = "" if key is None else str(key)
         self.to_recorder: int | None = None
@@ -98,15 +100,18 @@ class FileServerRecorder:
         return self
 
     def open_tap(self, call_later: Callable[[float, Callable[[], None]], object], log: Log) -> MessageTap:
-        """Return the tap of a worker, connected to the recorder; the worker was forked from this process."""
+        """Return the tap of a worker that is connected to the recorder; called in the worker after the fork.
+
+        Without a recorder, the tap records nothing.
+        """
         to_recorder = self.to_recorder
-        pipe = None if to_recorder is None else hand_pipe(to_recorder)
+        pipe = None if to_recorder is None else send_pipe(to_recorder)
         if to_recorder is None or pipe is None:
             return NullMessageTap()
 
         def renew() -> int | None:
             log.error("recorder-lost", hint="a new one is started; restart the server if none is")
-            return hand_pipe(to_recorder)
+            return send_pipe(to_recorder)
 
         return RecordingTap(
             pipe,
@@ -116,9 +121,10 @@ class FileServerRecorder:
         )
 
     def leave_to_workers(self) -> None:
-        """Leave the socket to the workers, so that the recorder sees their end, and watch the recorder.
+        """Close this process's end of the socket, and start the thread that restarts the recorder.
 
-        Nothing may be forked afterwards: there is a thread.
+        The recorder notices the exit of the last worker only if this process does not hold the socket.  No
+        worker may be forked afterwards, since the process then has a thread.
         """
         if self._to_recorder is not None:
             self._to_recorder.close()
@@ -127,24 +133,28 @@ class FileServerRecorder:
             self._watching.start()
 
     def __exit__(self, *_: object) -> None:
-        """Wait until the recorder has finished its file; all workers are gone."""
+        """Wait up to 3 s until the recorder has finished its file; all workers have exited before."""
         if self._watching is None:
             return
         self.leave_to_workers()
         self._is_over.set()
-        self._watching.join(_FINISH_S)
+        self._watching.join(_FINISH_TIMEOUT_S)
         if self._from_workers is not None:
             self._from_workers.close()
 
     def _watch(self, plan: RecorderPlan, process: Child) -> None:
-        """Start the recorder again until the workers or this server end; *process* is the first one."""
+        """Restart the recorder until it exits with 0, this server stops, or it has failed too often.
+
+        *process* is the first recorder.  When recording is given up, the socket is closed, so that workers
+        notice that there will be no recorder.
+        """
         ends: deque[float] = deque()
-        while process.wait() != 0 and not self._is_over.is_set():  # with 0 the workers are gone
+        while process.wait() != 0 and not self._is_over.is_set():  # it exits with 0 after the last worker
             now = self._clock()
             ends.append(now)
-            while ends[0] < now - _WITHIN_S:
+            while ends[0] < now - _RESTART_WINDOW_S:
                 ends.popleft()
-            if len(ends) > _MOST_RESTARTS:
+            if len(ends) > _MAX_RESTARTS:
                 _log(self._server, "recorder-given-up", "restart the server to record again", len(ends))
                 break
             if self._is_over.wait(self._restart_s * 2 ** (len(ends) - 1)):
@@ -165,7 +175,7 @@ class FileServerRecorder:
 
 
 def _log(server: str, event: str, hint: str, ends: int) -> None:
-    """Write a log line, as the server writes its own."""
+    """Write a log line of level error in the format of the server; *ends* is the number of recent exits."""
     line = {
         "time": time.time(),
         "level": "error",

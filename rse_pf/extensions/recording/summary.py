@@ -1,7 +1,7 @@
-"""Say by the summary of a finished file which of its chunks are worth reading.
+"""Select the chunks of a finished file that have to be read, by the summary at its end.
 
-A file that was cut off, or is still being written, has no summary and is read as a whole.  A summary may come
-from a stranger, too: one that lies hides messages of its own file, and nothing else.
+A file that was truncated, or is still being written, has no summary and is read as a whole.  Summaries are
+untrusted input: a false one only hides messages of its own file.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from typing import Any, NamedTuple
 
 __all__ = ["ChunkPlan", "Wanted", "plan_of", "robot_of"]
 
-_MAX_RECORD_BYTES = 64 << 20
+_MAX_RECORD_BYTES = 64 << 20  # largest MCAP record that is read: bounds the memory for a malformed file
 _DAMAGE = (struct.error, ValueError, OverflowError, KeyError, OSError)
-"""What the library raises for records that are no records, beside its own errors."""
+"""Exceptions that the library `mcap` raises for malformed records, in addition to McapError."""
 
 
 class Wanted(NamedTuple):
-    """Which messages are asked for: those of one robot (a pseudonym), and of a span of Unix time, ns.
+    """A selection of messages: those of one robot in a span of time.
 
-    ``robot`` is "" for all.
+    ``robot`` is the pseudonym of the robot, "" for all robots; ``begin_ns`` and ``end_ns`` are Unix times.
     """
 
     robot: str = ""
@@ -30,7 +30,11 @@ class Wanted(NamedTuple):
 
 
 class ChunkPlan(NamedTuple):
-    """What a summary tells: the channels by number (topic, metadata), and which chunks are read, in order."""
+    """Which parts of a file are read.
+
+    ``channels`` are topic and metadata of all channels of the file by number; ``is_read`` says for each
+    chunk, in the order of the file, whether it holds selected messages.
+    """
 
     channels: Mapping[int, tuple[str, dict[str, str]]]
     is_read: list[bool]
@@ -39,12 +43,13 @@ class ChunkPlan(NamedTuple):
 def plan_of(
     path: Path, wanted: Wanted, robot_of_channel: Callable[[str, dict[str, str]], str | None]
 ) -> ChunkPlan | None:
-    """Return what has to be read of a file, None if its summary does not say.
+    """Return which chunks of a file hold messages that *wanted* selects; None if it has no valid summary.
 
     Args:
-        path: Of a recording.
-        wanted: Which messages.
-        robot_of_channel: Returns the pseudonym of a channel's topic and metadata, None for other channels.
+        path: Path of the file.
+        wanted: The selected messages.
+        robot_of_channel: Returns the pseudonym of the robot of a channel from its topic and metadata, None
+            for a channel that belongs to no robot.
     """
     summary = _summary(path)
     if summary is None:
@@ -71,14 +76,14 @@ def plan_of(
 
 
 def robot_of(path: Path, topic: str) -> str | None:
-    """Return the pseudonym of the robot whose channel is *topic*, None if the summary does not know it."""
+    """Return the pseudonym of the robot whose channel is *topic*; None if the summary has no such channel."""
     summary = _summary(path)
     channels = () if summary is None else summary.channels.values()
     return next((channel.metadata.get("robot") for channel in channels if channel.topic == topic), None)
 
 
 def _summary(path: Path) -> Any:
-    """Return the library's summary of a file, None if it has none."""
+    """Return the summary of a file as `mcap` reads it; None if it is missing, malformed or without chunks."""
     from mcap.exceptions import McapError
     from mcap.reader import SeekingReader
 

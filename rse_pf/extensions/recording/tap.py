@@ -1,7 +1,7 @@
-"""Hand the messages of a worker over to the recorder process, so that a robot never waits for a recording.
+"""Pass the messages of a worker to the recorder process, so that no robot waits for a recording.
 
-In the path of a command nothing happens but that bytes are appended to a list.  Every 50 ms the list goes
-into a channel that never blocks.  While the recorder is slow or dead, messages are dropped and counted.
+While a command is processed, its bytes are only appended to a list.  Every 50 ms the list is written to a
+non-blocking socket.  If the recorder is too slow or has exited, messages are dropped and counted.
 """
 
 from __future__ import annotations
@@ -23,47 +23,57 @@ from rse_pf.identity import RobotId
 from rse_pf.wire import Command, Failure, Result
 
 __all__ = [
-    "CLOSED", "DOWN", "LOST", "OPENED", "PLAIN", "POSE", "UP", "Handed", "PipeReader", "RecordingTap",
-    "hand_pipe", "plain_parts", "pose_parts", "recording_pipe",
+    "ANSWER_WITH_POSE", "CLOSED", "DECODED_COMMAND", "DOWN", "LOST", "OPENED", "UP", "PipeEntry",
+    "PipeReader", "RecordingTap", "recording_pipe", "send_pipe", "split_answer_with_pose",
+    "split_decoded_command",
 ]  # fmt: skip
 
-OPENED, UP, DOWN, CLOSED, LOST, PLAIN, POSE = 1, 2, 3, 4, 5, 6, 7
-"""What one entry of the pipe is about; ``PLAIN`` is an ``UP``, ``POSE`` a ``DOWN``, whose content is told."""
+OPENED, UP, DOWN, CLOSED, LOST, DECODED_COMMAND, ANSWER_WITH_POSE = 1, 2, 3, 4, 5, 6, 7
+"""Kinds of the entries that a worker writes to the recorder: a connection was opened, a message was received
+from a robot (up) or sent to it (down), a connection was closed, messages were lost, a command whose id and
+texts precede the message, an answer whose command id and pose precede the message."""
 _ENTRY = struct.Struct("<BIQI")
-"""Kind, number of the connection, Unix time in ns, bytes of data that follow."""
-_PLAIN = struct.Struct("<QB")
-"""Id of the command, and bytes of its words; both and the message follow."""
-_MAX_WORDS_BYTES = 255
-_POSE = struct.Struct("<Q16d")
-"""Id of the command, and ``T_camera_world``, row-major; the message follows."""
-_MESSAGES = frozenset({UP, DOWN, PLAIN, POSE})
-_HAND_OVER_S = 0.05
-_RETRY_S = 0.005
-"""The kernel buffers 200 kB by default, which it may not take at once."""
-_BUFFER_BYTES = 1 << 20
+"""Head of an entry: its kind, the number of the connection, the Unix time in ns, and the number of bytes of
+data that follow."""
+_DECODED_HEAD = struct.Struct("<QB")
+"""Head of the data of a ``DECODED_COMMAND``: the id of the command, and the number of bytes of its texts.
+The texts and the message follow."""
+_MAX_TEXTS_BYTES = 255  # largest size of the texts of a command, which `_DECODED_HEAD` stores in one byte
+_POSE_HEAD = struct.Struct("<Q16d")
+"""Head of the data of an ``ANSWER_WITH_POSE``: the id of the command, and ``T_camera_world``, row-major.  The
+message follows."""
+_MESSAGE_KINDS = frozenset({UP, DOWN, DECODED_COMMAND, ANSWER_WITH_POSE})  # kinds that hold a message
+_WRITE_INTERVAL_S = 0.05  # time, seconds, for which entries are collected before they are written together
+_RETRY_S = 0.005  # time, seconds, until a socket that was full is written to again
+# Requested size of the send buffer of the socket; the kernel's default is 200 kB, and it may give less.
+_SOCKET_BUFFER_BYTES = 1 << 20
 _MAX_WAITING_BYTES = 8 << 20
-"""Bytes of messages that wait in a worker for a slow recorder; more are dropped."""
-_COPIED_BYTES = 1 << 20
+"""Largest number of bytes that wait in a worker for a slow recorder; further messages are dropped."""
+# Bytes of entries after which a copy for the socket ends: bounds the time of one call of `flush`.
+_MAX_COPIED_BYTES = 1 << 20
 
 
 def recording_pipe() -> tuple[int, int]:
-    """Return the descriptors of the recorder's end and of a worker's end, which never blocks.
+    """Return the file descriptors of the recorder's end and of a worker's end, which is non-blocking.
 
-    They are sockets: the writer of a pipe waits for a lock that its reader holds while it copies, and the
-    recorder, which has the lower priority, may be taken off the processor meanwhile.
+    They are sockets and not a pipe: the writer of a pipe waits for a lock that the reader holds while it
+    copies, and the kernel may suspend the recorder meanwhile, which has the lower priority.
     """
     ours, theirs = socket.socketpair()
-    theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+    theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BUFFER_BYTES)
     theirs.setblocking(False)
     ours.setblocking(True)
     return ours.detach(), theirs.detach()
 
 
-def hand_pipe(to_recorder: int) -> int | None:
-    """Return a worker's end of a new `recording_pipe` whose other end the recorder gets, None if it cannot.
+def send_pipe(to_recorder: int) -> int | None:
+    """Make a `recording_pipe`, send its recorder's end to the recorder, and return the worker's end.
+
+    None if the recorder's end cannot be sent, since there will be no recorder any more.
 
     Args:
-        to_recorder: Socket on which a recorder takes its ends, also one that is yet to start.
+        to_recorder: Socket from which the recorder receives its ends; a recorder that starts later also
+            receives them.
     """
     ours, theirs = recording_pipe()
     try:
@@ -89,10 +99,10 @@ class RecordingTap:
         "_on_dead",
         "_open",
         "_renew",
+        "_reported_dropped",
         "_rest",
         "_rest_messages",
         "_time_ns",
-        "_told",
         "_waiting_bytes",
         "dropped",
         "is_dead",
@@ -107,25 +117,26 @@ class RecordingTap:
         renew: Callable[[], int | None] = lambda: None,
         time_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Hand nothing over yet.
+        """Prepare to write to the pipe; nothing is written yet.
 
         Args:
             fd: The worker's end of a `recording_pipe`.
-            call_later: Of the event loop.
-            on_dead: Called once when the recorder is gone, and there will be no other.
-            renew: Returns the worker's end of a pipe to the next recorder when one is gone, None if there
-                will be none.
-            time_ns: Unix time.
+            call_later: The method of the event loop that calls a function after some seconds.
+            on_dead: Called once when the recorder has exited and no other one will start.
+            renew: Called when the recorder has exited; returns the worker's end of a pipe to the next
+                recorder, or None if there will be none.
+            time_ns: Returns the Unix time in nanoseconds.
         """
         self.dropped = 0
-        """Messages that no recording will hold."""
+        """Number of messages that no recording holds, because the recorder was too slow or had exited."""
         self.is_dead = False
+        """Whether the recorder has exited and no other one will start; then nothing is recorded."""
         self._fd = fd
         self._call_later = call_later
         self._on_dead, self._renew = on_dead, renew
         self._open: dict[int, bytes] = {}
         self._time_ns = time_ns
-        self._connections = self._told = 0
+        self._connections = self._reported_dropped = 0
         self._entries: list[tuple[int, int, int, bytes]] = []
         self._waiting_bytes = 0
         self._rest = memoryview(b"")
@@ -133,7 +144,7 @@ class RecordingTap:
         self._is_waiting = False
 
     def open_connection(self, codec: str, robot: RobotId) -> int:
-        """Return the number of a new connection, for the other calls."""
+        """Record that *robot* opened a connection, and return its number for the other methods."""
         self._connections += 1
         described = self._open[self._connections] = json.dumps([codec, *robot]).encode()
         self._append(OPENED, self._connections, described)
@@ -145,43 +156,45 @@ class RecordingTap:
         self._append(CLOSED, connection, b"")
 
     def observe_received(self, connection: int, data: bytes) -> None:
-        """Record a message from the robot."""
+        """Record a message from the robot; it is dropped if too much is waiting."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(UP, connection, data)
         else:
             self.dropped += 1
 
     def observe_command(self, data: bytes, command: Command) -> None:
-        """Record what *data*, the message that was received last, was decoded to.
+        """Record id and texts of the *command* that *data*, the message that was received last, holds.
 
-        The recorder then need not inflate it.  That is possible if the codec decoded the payload to a
-        structure, which it does only if it knows all fields; its only texts are ``stream`` and ``trace``.
+        This spares the recorder to inflate the message.  It is done only if the codec has decoded the payload
+        to a structure, whose fields are all known: then ``stream`` and ``trace`` are the only free texts.
         """
         if isinstance(command.payload, msgspec.Struct):
             text = f"{command.stream} {command.trace}".encode()
-            if len(text) <= _MAX_WORDS_BYTES:
-                self._describe_newest(PLAIN, data, _PLAIN.pack(command.id, len(text)) + text)
+            if len(text) <= _MAX_TEXTS_BYTES:
+                self._describe_newest(DECODED_COMMAND, data, _DECODED_HEAD.pack(command.id, len(text)) + text)
 
     def observe_sent(self, connection: int, data: bytes) -> None:
-        """Record a message to the robot."""
+        """Record a message to the robot; it is dropped if too much is waiting."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(DOWN, connection, data)
         else:
             self.dropped += 1
 
     def observe_answer(self, data: bytes, command: Command, answer: Result | Failure) -> None:
-        """Record the pose in *data*, the message that was sent last, so that nobody inflates it again.
+        """Record the pose of the *answer* that *data*, the message that was sent last, holds.
 
-        Nothing is recorded if the answer has no pose, or may hold texts of the robot.
+        This spares the recorder to inflate the message.  The pose is not recorded if the answer has none, or
+        if the payload of the command was not decoded to a structure: the answer may then hold texts of the
+        robot.
         """
         if not isinstance(command.payload, msgspec.Struct) or not isinstance(answer, Result):
             return
         pose = getattr(answer.reply, "T_camera_world", None)
         if isinstance(pose, np.ndarray) and pose.dtype == np.float64 and pose.size == 16:
-            self._describe_newest(POSE, data, answer.id.to_bytes(8, "little") + pose.tobytes())
+            self._describe_newest(ANSWER_WITH_POSE, data, answer.id.to_bytes(8, "little") + pose.tobytes())
 
     def _describe_newest(self, kind: int, data: bytes, head: bytes) -> None:
-        """Put *head* before the newest entry, if that is *data*."""
+        """Change the newest entry to *kind* and put *head* before its data, if its data is *data*."""
         if not self._entries:
             return
         _, connection, time_ns, taken = self._entries[-1]
@@ -190,7 +203,7 @@ class RecordingTap:
             self._waiting_bytes += len(head)
 
     def flush(self) -> None:
-        """Write what waits into the pipe, as much as it takes now."""
+        """Write waiting entries to the pipe until it is full; write the others later."""
         self._is_waiting = False
         try:
             while True:
@@ -208,7 +221,7 @@ class RecordingTap:
             if error.errno == errno.ENOBUFS:
                 self._wait(_RETRY_S)
             else:
-                self._die()
+                self._replace_recorder()
 
     def _append(self, kind: int, connection: int, data: bytes) -> None:
         if self.is_dead:
@@ -218,33 +231,40 @@ class RecordingTap:
         if not self._is_waiting:
             self._wait()
 
-    def _wait(self, seconds: float = _HAND_OVER_S) -> None:
+    def _wait(self, seconds: float = _WRITE_INTERVAL_S) -> None:
         self._is_waiting = True
         self._call_later(seconds, self.flush)
 
     def _pack(self) -> bytes:
-        """Return the next entries as they are in the pipe, a bounded copy of them."""
+        """Remove the next entries, about 1 MiB at most, and return them in the format of the pipe.
+
+        If no entry remains and messages were dropped since the last report, an entry ``LOST`` with their
+        total number is added.
+        """
         parts: list[bytes] = []
         size = count = messages = 0
         for kind, connection, time_ns, data in self._entries:
             parts += (_ENTRY.pack(kind, connection, time_ns, len(data)), data)
             size += len(data)
             count += 1
-            messages += kind in _MESSAGES
-            if size >= _COPIED_BYTES:
+            messages += kind in _MESSAGE_KINDS
+            if size >= _MAX_COPIED_BYTES:
                 break
         del self._entries[:count]
         self._rest_messages = messages
-        if self.dropped != self._told and not self._entries:
-            self._told = self.dropped
+        if self.dropped != self._reported_dropped and not self._entries:
+            self._reported_dropped = self.dropped
             lost = _ENTRY.pack(LOST, 0, self._time_ns(), 8) + struct.pack("<Q", self.dropped)
             self._waiting_bytes += len(lost)
             parts.append(lost)
         return b"".join(parts)
 
-    def _die(self) -> None:
-        """Go on with the next recorder, which knows no connection yet, or with none."""
-        self.dropped += self._rest_messages  # some of which it may have got
+    def _replace_recorder(self) -> None:
+        """Connect to the next recorder after one has exited, or stop recording if there will be none.
+
+        The next recorder first gets an ``OPENED`` entry for every open connection.
+        """
+        self.dropped += self._rest_messages  # an upper bound: the recorder may have received some of them
         self._rest, self._rest_messages = memoryview(b""), 0
         with suppress(OSError):
             os.close(self._fd)
@@ -258,15 +278,15 @@ class RecordingTap:
             self._wait(_RETRY_S)
             return
         self.is_dead = True
-        self.dropped += sum(kind in _MESSAGES for kind, _, _, _ in self._entries)
+        self.dropped += sum(kind in _MESSAGE_KINDS for kind, _, _, _ in self._entries)
         self._entries.clear()
         self._open.clear()
         self._waiting_bytes = 0
         self._on_dead()
 
 
-class Handed(NamedTuple):
-    """One entry of the pipe: its kind, the number of the connection, Unix time in ns, and the bytes."""
+class PipeEntry(NamedTuple):
+    """One entry of the pipe: its kind, the number of the connection, the Unix time in ns, and its data."""
 
     kind: int
     connection: int
@@ -274,33 +294,33 @@ class Handed(NamedTuple):
     data: bytes
 
 
-def plain_parts(data: bytes) -> tuple[int, bytes, bytes]:
-    """Return the id, the words and the message of a ``PLAIN`` entry."""
-    identity, size = _PLAIN.unpack_from(data)
-    end = _PLAIN.size + size
-    return identity, data[_PLAIN.size : end], data[end:]
+def split_decoded_command(data: bytes) -> tuple[int, bytes, bytes]:
+    """Return the id of the command, its texts, and the message in the data of a ``DECODED_COMMAND``."""
+    identity, size = _DECODED_HEAD.unpack_from(data)
+    end = _DECODED_HEAD.size + size
+    return identity, data[_DECODED_HEAD.size : end], data[end:]
 
 
-def pose_parts(data: bytes) -> tuple[int, tuple[float, ...], bytes]:
-    """Return the id, ``T_camera_world`` and the message of a ``POSE`` entry."""
-    identity, *pose = _POSE.unpack_from(data)
-    return identity, tuple(pose), data[_POSE.size :]
+def split_answer_with_pose(data: bytes) -> tuple[int, tuple[float, ...], bytes]:
+    """Return the id of the command, its ``T_camera_world``, and the message of an ``ANSWER_WITH_POSE``."""
+    identity, *pose = _POSE_HEAD.unpack_from(data)
+    return identity, tuple(pose), data[_POSE_HEAD.size :]
 
 
 class PipeReader:
-    """Cuts what comes out of a pipe into entries."""
+    """Split the bytes that come out of a pipe into entries."""
 
     def __init__(self) -> None:
         self._left = b""
 
-    def entries(self, data: bytes) -> Iterator[Handed]:
-        """Yield the entries that *data* completes."""
+    def entries(self, data: bytes) -> Iterator[PipeEntry]:
+        """Yield the entries that are complete after *data*; the rest is kept for the next call."""
         whole = self._left + data if self._left else data
         at, end, head = 0, len(whole), _ENTRY.size
         while end - at >= head:
             kind, connection, time_ns, size = _ENTRY.unpack_from(whole, at)
             if end - at - head < size:
                 break
-            yield Handed(kind, connection, time_ns, whole[at + head : at + head + size])
+            yield PipeEntry(kind, connection, time_ns, whole[at + head : at + head + size])
             at += head + size
         self._left = whole[at:]

@@ -1,7 +1,7 @@
-"""Write a recording: files of bounded size in a folder of bounded size, the oldest of which are deleted.
+"""Write a recording: files of bounded size into a folder of bounded size, whose oldest files are deleted.
 
-A file that is being written is locked, so that no other process that writes to the folder deletes it.
-Nothing here runs in a process that serves robots.
+The file that is being written is locked, so that other processes that record to the folder do not delete it.
+This module does not run in processes that serve robots.
 """
 
 from __future__ import annotations
@@ -33,19 +33,22 @@ from rse_pf.extensions.recording.mcap_file import McapFile
 __all__ = ["RecordingWriter", "make_folder", "with_recordings"]
 
 MAX_FILE_BYTES = 1 << 28
-"""Size of a file at which the next one begins."""
-_PRUNE_NS = 10_000_000_000
-_RETRY_NS = 5_000_000_000
+"""Size of a file, bytes, at which it is finished and the next one begins."""
+_PRUNE_INTERVAL_NS = 10_000_000_000  # time, ns, between two checks of the size of the folder
+_RETRY_INTERVAL_NS = 5_000_000_000  # time, ns, after a failed write until a new file is tried
+# Number of channels at which the next file begins; MCAP has 16 bits for the number of a channel.
 _MAX_CHANNELS = 50_000
-_OWNER_ONLY = 0o600
+_FILE_MODE = 0o600  # recordings are readable by their user only
 
 
 def with_recordings(settings: PlatformSettings, folder: Path | None) -> PlatformSettings:
-    """Return *settings* with recordings in *folder*, unchanged if it is None and none are asked for.
+    """Return *settings* that record to *folder*, or for None to the folder that they name already.
+
+    The folder is created.  Without any folder, *settings* are returned unchanged.
 
     Raises:
-        MissingExtra: mcap is not installed.
-        UsageError: Recordings cannot be written there.
+        MissingExtra: The package mcap is not installed.
+        UsageError: Files cannot be written to the folder.
     """
     chosen = settings.recording.folder if folder is None else str(folder)
     if not chosen:
@@ -56,10 +59,10 @@ def with_recordings(settings: PlatformSettings, folder: Path | None) -> Platform
 
 
 def make_folder(folder: Path) -> Path:
-    """Return the absolute path of *folder*, which is made if it is missing; recordings can be written there.
+    """Create *folder* if it is missing, check that files can be written to it, and return its absolute path.
 
     Raises:
-        UsageError: It is a file, or this user cannot write to it.
+        UsageError: *folder* is a file, or files cannot be written to it.
     """
     folder = folder.absolute()
     if folder.exists() and not folder.is_dir():
@@ -80,10 +83,11 @@ def make_folder(folder: Path) -> Path:
 
 
 class RecordingWriter:
-    """The files of one server or robot; a new one begins when the last is full.
+    """Write the messages of one server or robot into files; a new file begins when the last one is full.
 
-    A channel keeps its number across files.  Where the disk is full or gone, messages are dropped and
-    counted in ``dropped``, ``problem`` says why, and a new file is tried every five seconds.
+    A channel keeps its number across files.  If a write fails, the messages of the unwritten chunk and all
+    further ones are dropped and counted in ``dropped``, ``problem`` holds the reason, and a new file is tried
+    every five seconds.
     """
 
     def __init__(
@@ -96,15 +100,16 @@ class RecordingWriter:
         max_bytes: int,
         metadata: Mapping[str, str] | None = None,
     ) -> None:
-        """Write nothing yet.
+        """Prepare to write; the first message creates the first file.
 
         Args:
-            folder: Where the files are; it exists.
-            server: Part of the names of the files.
-            started_ns: Unix time, ns; part of the names of the files.
-            max_file_bytes: Size at which the next file begins.
-            max_bytes: Size of all recordings of the folder above which the oldest are deleted.
-            metadata: Further values for the metadata record of each file; ``version`` is the platform's.
+            folder: Existing folder for the files.
+            server: Name of the server, which is part of the names of the files.
+            started_ns: Unix time of the start, ns, which is part of the names of the files.
+            max_file_bytes: Size of a file, bytes, at which the next one begins.
+            max_bytes: Size of all recordings in the folder, bytes, above which the oldest ones are deleted.
+            metadata: Further values for the metadata record of each file, such as the ``version`` of the
+                software.
         """
         self.dropped = 0
         self._waiting = 0
@@ -134,30 +139,36 @@ class RecordingWriter:
 
     @property
     def path(self) -> Path | None:
-        """The file that is being written, None before the first message and while the disk is full."""
+        """The file that is being written; None before the first message, and after a failed write."""
         return self._path
 
     def channel(self, topic: str, encoding: str, metadata: Mapping[str, str], schema: str = "") -> int:
-        """Return the number of a new channel, for `add`; *schema* is one of `file_format.SCHEMAS`."""
+        """Return the number of a new channel for `add`.
+
+        *schema* is the name of one of `file_format.SCHEMAS`, "" for none.
+        """
         self._next_channel += 1
         described = (schema, JSON_SCHEMA_ENCODING, SCHEMAS[schema]) if schema else None
         self._known[self._next_channel] = topic, encoding, described, metadata
         return self._next_channel
 
     def forget(self, channel: int) -> None:
-        """Note that *channel* gets no further message."""
+        """Remove *channel* after its last message, so that later files do not describe it."""
         self._known.pop(channel, None)
         self._numbers.pop(channel, None)
 
     def add_json(self, topic: str, schema: str, time_ns: int, value: object) -> None:
-        """Add a message to the JSON channel *topic*, which is made with the first."""
+        """Add *value* as a message to the JSON channel *topic*, which the first message creates."""
         channel = self._json.get(topic)
         if channel is None:
             channel = self._json[topic] = self.channel(topic, JSON_ENCODING, {}, schema)
         self.add(channel, time_ns, encode_json(value))
 
     def add(self, channel: int, time_ns: int, data: bytes) -> None:
-        """Add a message of *channel*, taken at *time_ns* (Unix); count it as dropped if the disk is full."""
+        """Add a message to *channel*; *time_ns* is its Unix time.
+
+        Opens a new file if none is open.  If the write fails, the message counts as dropped.
+        """
         try:
             file = self._file or self._open(time_ns)
             number = self._numbers.get(channel)
@@ -173,7 +184,10 @@ class RecordingWriter:
             self._fail(error, time_ns)
 
     def flush(self, now_ns: int) -> None:
-        """Write what is old enough at *now_ns* (Unix); begin the next file if this one is full."""
+        """Write the chunk if it is old enough at *now_ns* (Unix time), and close the file if it is full.
+
+        Every ten seconds the oldest recordings are deleted if the folder is too large.
+        """
         file = self._file
         if file is None:
             return
@@ -183,13 +197,13 @@ class RecordingWriter:
                 self._waiting = 0
             if file.size_bytes >= self._max_file_bytes or file.channels >= _MAX_CHANNELS:
                 self.close()
-            if now_ns - self._pruned_ns >= _PRUNE_NS:
+            if now_ns - self._pruned_ns >= _PRUNE_INTERVAL_NS:
                 self._prune(now_ns)
         except OSError as error:
             self._fail(error, now_ns)
 
     def close(self) -> None:
-        """Finish the file, which a later message would follow by a new one."""
+        """Finish the file; a later message would begin a new one.  A failed write sets ``problem``."""
         file, self._file = self._file, None
         try:
             if file is not None:
@@ -197,10 +211,13 @@ class RecordingWriter:
         except OSError as error:
             self.problem = error.strerror or str(error)
         finally:
-            self._leave()
+            self._close_descriptor()
 
     def _open(self, now_ns: int) -> McapFile:
-        """Begin the next file; raises OSError."""
+        """Create, lock and return the next file.
+
+        Raises OSError if that fails, and within five seconds after a failed write.
+        """
         if now_ns < self._retry_ns:
             raise OSError(0, self.problem)
         self._number += 1
@@ -209,7 +226,7 @@ class RecordingWriter:
             self._number += 1
             path = self._folder / str(FileName(self._started, self._server, self._number))
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
-        self._fd, self._path = os.open(path, flags, _OWNER_ONLY), path
+        self._fd, self._path = os.open(path, flags, _FILE_MODE), path
         fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         file = McapFile(self._fd)
         try:
@@ -224,16 +241,16 @@ class RecordingWriter:
         return file
 
     def _fail(self, error: OSError, now_ns: int) -> None:
-        """Give up the file, which is readable up to its last chunk, and try a new one later."""
+        """Close the file unfinished, count its unwritten messages as dropped, and allow a new file in 5 s."""
         self.dropped += max(1, self._waiting)
         self._waiting = 0
         if now_ns >= self._retry_ns:
             self.problem = error.strerror or str(error)
-            self._retry_ns = now_ns + _RETRY_NS
+            self._retry_ns = now_ns + _RETRY_INTERVAL_NS
         self._file = None
-        self._leave()
+        self._close_descriptor()
 
-    def _leave(self) -> None:
+    def _close_descriptor(self) -> None:
         self._numbers.clear()
         self._path = None
         if self._fd >= 0:
@@ -242,7 +259,7 @@ class RecordingWriter:
             self._fd = -1
 
     def _prune(self, now_ns: int) -> None:
-        """Delete the oldest recordings of the folder that nobody writes, while all are too long."""
+        """Delete the oldest recordings that no process writes, until at most ``max_bytes`` remain."""
         self._pruned_ns = now_ns
         recordings = []
         for path in self._folder.glob(f"*{SUFFIX}"):
@@ -259,7 +276,7 @@ class RecordingWriter:
 
 
 def _delete_unlocked(path: Path) -> bool:
-    """Delete *path* unless a process writes it; return whether it is gone."""
+    """Delete the file *path* unless a process has locked it; return whether it was deleted."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:

@@ -1,4 +1,4 @@
-"""Replay of recorded commands: solve them again, compare to the byte, report and export them.
+"""Replay of recorded commands: solve them again, compare the answers byte by byte, and report them.
 
-Writing a recording belongs to `rse_pf.extensions.recording`.
+Recordings are written and read by `rse_pf.extensions.recording`.
 """

@@ -34,14 +34,16 @@ if TYPE_CHECKING:
 
 __all__ = ["ACTION"]
 
-_SHOWN, _IN_PAGE, _LISTED_IN_JSON = 20, 5, 500
+_SHOWN = 20  # largest number of troubles, and of changed answers, that are printed
+_IN_PAGE = 5  # number of the worst commands whose reports are in the HTML file
+_LISTED_IN_JSON = 500  # largest number of troubles in JSON
 _ENGINES = ("native", "opencv")
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayRequest:
-    """A recording, and what is solved again and shown."""
+    """The options of ``rse-pf replay``."""
 
     file: Path = option(metavar="FILE", help="a recording, or a folder of recordings")
     command: str | None = option(
@@ -62,7 +64,7 @@ class ReplayRequest:
 
 
 def replay_recording(request: ReplayRequest, settings: PlatformSettings) -> int:
-    """List, solve again or show; return 1 if an answer that should be equal is not."""
+    """Run ``rse-pf replay``; return the exit code, 1 if an answer differs that should be equal, else 0."""
     require("replay")
     from rse_pf.extensions.recording.replay.limited import LimitedReplay
 
@@ -75,7 +77,7 @@ def replay_recording(request: ReplayRequest, settings: PlatformSettings) -> int:
 
 
 def _check(request: ReplayRequest) -> None:
-    """Raise UsageError for what contradicts itself, before any work."""
+    """Raise UsageError for options that contradict each other or the files, before any work."""
     path = request.file
     if request.command is not None and request.all:
         raise UsageError("--command is one command, and --all is all of them", hint="leave one of them out")
@@ -92,7 +94,7 @@ def _check(request: ReplayRequest) -> None:
 
 
 def _overrides(request: ReplayRequest) -> Overrides:
-    """Return what is to be tried; raises UsageError for a number out of its range."""
+    """Return the solver options of the request; raises UsageError for a number out of range."""
     from rse_pf.errors import BadRequest
     from rse_pf.extensions.recording.replay.solving import Overrides
 
@@ -112,7 +114,7 @@ def _overrides(request: ReplayRequest) -> Overrides:
     return chosen
 
 
-# --- a whole recording ------------------------------------------------------------------------------------
+# --- output for a whole recording ---
 
 
 def _show_all(request: ReplayRequest, replay: LimitedReplay, overrides: Overrides) -> int:
@@ -167,7 +169,7 @@ def _show_overview(overview: Overview, request: ReplayRequest) -> None:
     show("", f"look at one: rse-pf replay {request.file} --command {overview.troubles[0].id}")
 
 
-# --- one command ------------------------------------------------------------------------------------------
+# --- output for one command ---
 
 
 def _show_one(request: ReplayRequest, command: str, replay: LimitedReplay, overrides: Overrides) -> int:

@@ -1,10 +1,10 @@
-"""Replay in a process with limits: a recording may come from a stranger.
+"""Replay in a process with limits of memory and time, since recordings are untrusted input.
 
     with LimitedReplay(settings) as replay:
         report = replay.command(path, "0123456789abcdef:42")
 
-What reads, decodes, solves and draws runs there; the caller gets typed values.  A file that crashes
-that process, or takes all its memory or time, costs one error.
+Files are read, decoded, solved and drawn in that process, which returns typed values.  A file that crashes
+the process, or exceeds its memory or time, causes an error for the caller and nothing else.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from rse_pf.processes.limited import Handler, LimitedProcesses, Overran, Process
 
 __all__ = ["LimitedReplay", "replayer"]
 
-_MEMORY_BYTES = 1 << 30
-_MAX_REPLY_BYTES = 64 << 20
-_RECORDING_S = 6 * 3600.0
-"""CPU seconds, and seconds, for a whole recording."""
-_TARGET = "rse_pf.extensions.recording.replay.limited:replayer"
+_MAX_MEMORY_BYTES = 1 << 30  # memory of the process
+_MAX_REPLY_BYTES = 64 << 20  # size of the encoded result of one task
+_MAX_RECORDING_S = 6 * 3600.0
+"""Largest CPU time and largest wall time of one task, seconds: enough for a whole recording."""
+_TARGET = "rse_pf.extensions.recording.replay.limited:replayer"  # the function that the process runs
 
 T = TypeVar("T")
 
 
-class _Order(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What the process is to do."""
+class _Task(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A call of one function of `run` in the process with limits.
+
+    ``do`` is ``overview``, ``report`` or ``find``; the other fields are arguments of these functions.
+    """
 
     do: str
     path: str
@@ -51,14 +54,14 @@ class _Order(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class LimitedReplay:
-    """Answers questions about recordings; nothing is started before the first one."""
+    """Call the functions of `run` in a process with limits, which the first call starts."""
 
     def __init__(self, settings: PlatformSettings | None = None) -> None:
-        """Keep the limits of messages; *settings* are those of this machine."""
+        """Prepare the process; *settings* hold the limits of messages, None for the defaults."""
         self._processes = LimitedProcesses(
             _TARGET,
             ProcessLimits(
-                memory_bytes=_MEMORY_BYTES, cpu_s=_RECORDING_S, max_reply_bytes=_MAX_REPLY_BYTES
+                memory_bytes=_MAX_MEMORY_BYTES, cpu_s=_MAX_RECORDING_S, max_reply_bytes=_MAX_REPLY_BYTES
             ),
             configuration=json.dumps((settings or PlatformSettings()).to_dict()), niceness=0,
         )  # fmt: skip
@@ -77,21 +80,27 @@ class LimitedReplay:
         overrides: Overrides | None = None,
         worst: int = 20,
     ) -> run.Overview:
-        """Return what `run.overview` returns; raises RsePfError."""
-        order = _Order(
+        """Summarise a recording, see `run.overview`.
+
+        Raises RsePfError; BadRequest also if the file exceeds the limits of the process.
+        """
+        task = _Task(
             do="overview", path=str(path), solve=solve, overrides=overrides or Overrides(), worst=worst,
         )  # fmt: skip
-        return self._ask(order, run.Overview)
+        return self._ask(task, run.Overview)
 
     def command(
         self, path: Path, identity: str, overrides: Overrides | None = None, *, with_picture: bool = True
     ) -> CommandReport:
-        """Return what `run.report` returns; raises RsePfError."""
-        order = _Order(
+        """Report one command, see `run.report`.
+
+        Raises RsePfError; BadRequest also if the file exceeds the limits of the process.
+        """
+        task = _Task(
             do="report", path=str(path), identity=identity, overrides=overrides or Overrides(),
             with_picture=with_picture,
         )  # fmt: skip
-        return self._ask(order, CommandReport)
+        return self._ask(task, CommandReport)
 
     def find(
         self,
@@ -102,21 +111,24 @@ class LimitedReplay:
         near_s: float | None = None,
         command_bytes: int | None = None,
     ) -> str | None:
-        """Return ``CONNECTION:ID`` of a command as `run.find` does, None if there is none."""
-        order = _Order(
+        """Return ``CONNECTION:ID`` of the command that `run.find` finds, None if there is none.
+
+        Raises RsePfError; BadRequest also if the file exceeds the limits of the process.
+        """
+        task = _Task(
             do="find", path=str(path), trace=trace, number=id, near_s=near_s, command_bytes=command_bytes
         )
-        return self._ask(order, str) or None
+        return self._ask(task, str) or None
 
     def close(self) -> None:
         """End the process."""
         self._processes.close()
 
-    def _ask(self, order: _Order, kind: type[T]) -> T:
-        path = Path(order.path)
-        recording_files(path)  # what is plainly wrong is told before a process is started
+    def _ask(self, task: _Task, kind: type[T]) -> T:
+        path = Path(task.path)
+        recording_files(path)  # a missing file is reported before a process is started
         try:
-            data = self._processes.call(msgspec.msgpack.encode(order), _RECORDING_S)
+            data = self._processes.call(msgspec.msgpack.encode(task), _MAX_RECORDING_S)
             return msgspec.msgpack.decode(data, type=kind)
         except Overran:
             raise BadRequest(f"{path} takes too long to read", hint="replay one --command of it") from None
@@ -129,28 +141,26 @@ class LimitedReplay:
 
 
 def replayer(configuration: str) -> Handler:
-    """Return what answers orders in the process with limits; *configuration* is the settings in JSON."""
+    """Return the function that runs tasks in the limited process; *configuration* is settings in JSON."""
     settings = PlatformSettings.from_dict(json.loads(configuration))
 
     def answer(data: bytes) -> bytes:
-        order = msgspec.msgpack.decode(data, type=_Order)
-        path = Path(order.path)
+        task = msgspec.msgpack.decode(data, type=_Task)
+        path = Path(task.path)
         reply: Any
-        if order.do == "overview":
+        if task.do == "overview":
             reply = run.overview(
-                path, settings, solve=order.solve, overrides=order.overrides, worst=order.worst,
+                path, settings, solve=task.solve, overrides=task.overrides, worst=task.worst,
             )  # fmt: skip
-        elif order.do == "report":
-            reply = run.report(
-                path, settings, order.identity, order.overrides, with_picture=order.with_picture
-            )
-        elif order.do == "find":
+        elif task.do == "report":
+            reply = run.report(path, settings, task.identity, task.overrides, with_picture=task.with_picture)
+        elif task.do == "find":
             reply = run.find(
-                path, settings, trace=order.trace, number=order.number, near_s=order.near_s,
-                command_bytes=order.command_bytes,
+                path, settings, trace=task.trace, number=task.number, near_s=task.near_s,
+                command_bytes=task.command_bytes,
             )  # fmt: skip
         else:
-            raise BadMessage(f"no order {order.do!r}")
+            raise BadMessage(f"no task {task.do!r}")
         return msgspec.msgpack.encode(reply)
 
     return answer

@@ -1,7 +1,7 @@
-"""The report of a replay as one HTML file that needs nothing else: no script, no font, no other file.
+"""Write the report of a replay as one HTML file without scripts, fonts or references to other files.
 
-Names and messages come from robots and servers; all of them are escaped, and the content security policy of
-the page lets nothing run or be loaded.
+Names and messages from robots and servers are untrusted input: they are escaped, and the content security
+policy of the page forbids scripts and requests.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from rse_pf.terminal import counted, printable
 __all__ = ["html_page"]
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
-_GRID_COLUMNS = 8
-_BARS_WIDTH, _BARS_HEIGHT, _LABEL_PX = 460, 170, 24
+_GRID_COLUMNS = 8  # number of columns of the grid in which matches are counted, as in a `CommandReport`
+_BARS_WIDTH = 460  # width of a bar chart, CSS pixels
+_BARS_HEIGHT = 170  # height of a bar chart with its labels, CSS pixels
+_LABEL_PX = 24  # height for labels above and below the bars, CSS pixels
 _STYLE = """
 :root { color-scheme: light dark;
   --paper: #ffffff; --ink: #1e222a; --pale: #5b6472; --line: #d4d8de; --panel: #f4f6f8;
@@ -55,7 +57,7 @@ svg { max-width: 100%; height: auto; } svg text { fill: var(--ink); font: 11px s
 def html_page(
     reports: Sequence[CommandReport] = (), *, overview: Overview | None = None, title: str = "Replay"
 ) -> str:
-    """Return the page of *reports*, below the table of *overview* if there is one."""
+    """Return an HTML page with the table of *overview*, if given, and the *reports* of commands."""
     parts = [_overview(overview)] if overview is not None else []
     parts += [_report(report) for report in reports]
     return (
@@ -175,10 +177,10 @@ def _figure(drawn: str, caption: str) -> str:
 
 
 def _bars(counts: Histogram, unit: str) -> str:
-    """Return two rows of bars side by side, inliers and outliers."""
+    """Return an SVG bar chart with two bars for each bin of the histogram: inliers and outliers."""
     bins = len(counts.inliers)
     most = max(1, *counts.inliers, *counts.outliers)
-    step, room = _BARS_WIDTH / max(1, bins), _BARS_HEIGHT - 2 * _LABEL_PX
+    step, bars_height = _BARS_WIDTH / max(1, bins), _BARS_HEIGHT - 2 * _LABEL_PX
     base = _BARS_HEIGHT - _LABEL_PX
     parts = [
         f'<svg viewBox="0 0 {_BARS_WIDTH} {_BARS_HEIGHT}" width="{_BARS_WIDTH}" role="img" '
@@ -186,7 +188,7 @@ def _bars(counts: Histogram, unit: str) -> str:
     ]
     for place, (inliers, outliers) in enumerate(zip(counts.inliers, counts.outliers, strict=True)):
         for kind, count, shift in (("i", inliers, 0.12), ("o", outliers, 0.5)):
-            height = room * count / most
+            height = bars_height * count / most
             left = (place + shift) * step
             if count:
                 parts.append(
@@ -204,7 +206,7 @@ def _bars(counts: Histogram, unit: str) -> str:
 
 
 def _cells(counts: Sequence[int], kind: str) -> str:
-    """Return the cells of the image, darker where more lie."""
+    """Return an SVG of the image's cells, darker with more matches; *kind* is ``i`` (inliers) or ``o``."""
     most, size = max(1, *counts), 40
     rows = len(counts) // _GRID_COLUMNS
     parts = [
@@ -265,7 +267,7 @@ def _attempts(title: str, first: str, attempts: Sequence[Attempt], seen: Command
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table whose cells are HTML already."""
+    """Return an HTML table, empty without rows; headings are escaped here, cells are HTML already."""
     if not rows:
         return ""
     top = "".join(f'<th scope="col">{_text(heading)}</th>' for heading in head)

@@ -1,7 +1,7 @@
-"""The picture of a command's matches: inliers, outliers and where the pose puts the points.
+"""Draw the matches of a command: inliers, outliers, and the projections of their points by the pose.
 
-On the thumbnail of the frame if there is one.  Drawn with Pillow.  A thumbnail comes from a robot: it is
-opened in a process with limits only, and its size is judged before it is decoded.
+The background is the thumbnail of the frame if there is one.  Thumbnails are untrusted input: they are opened
+only in a process with limits, and their size is checked before they are decoded.
 """
 
 from __future__ import annotations
@@ -17,14 +17,18 @@ from rse_pf.geometry import Array, Camera, transform
 
 __all__ = ["INLIER", "MAX_THUMBNAIL_PX", "OUTLIER", "match_picture"]
 
-INLIER, OUTLIER, MOVED = (0, 114, 178), (213, 94, 0), (230, 159, 0)
-"""Distinct for colour-blind readers as well; Okabe and Ito 2008."""
-MAX_THUMBNAIL_PX = 1 << 20
-_MAX_THUMBNAIL_BYTES = 1 << 20
-_WIDTH_PX, _MIN_HEIGHT_PX, _MAX_HEIGHT_PX = 960, 120, 1920
-_BACKGROUND, _PALE = (238, 240, 243), (255, 255, 255)
-_MAX_DRAWN = 5000
-_NEAR_M = 1e-6
+INLIER, OUTLIER, REPROJECTED = (0, 114, 178), (213, 94, 0), (230, 159, 0)
+"""Colours (RGB) of inliers, of outliers, and of lines from outliers to their projections; colour-blind
+readers can distinguish them (Okabe and Ito 2008)."""
+MAX_THUMBNAIL_PX = 1 << 20  # largest number of pixels of a thumbnail that is decoded
+_MAX_THUMBNAIL_BYTES = 1 << 20  # largest JPEG of a thumbnail that is opened
+_WIDTH_PX = 960  # width of the picture
+_MIN_HEIGHT_PX = 120  # smallest height of the picture, for malformed sizes of the camera
+_MAX_HEIGHT_PX = 1920  # largest height of the picture, for malformed sizes of the camera
+_BACKGROUND = (238, 240, 243)  # colour of the picture without a thumbnail
+_WHITE = (255, 255, 255)
+_MAX_DRAWN = 5000  # largest number of matches that are drawn: bounds the time
+_MIN_DEPTH_M = 1e-6  # smallest depth of a point that is projected: others are behind the camera
 
 
 def match_picture(
@@ -36,15 +40,15 @@ def match_picture(
     T_camera_world: Array | None,
     thumbnail: bytes | None,
 ) -> bytes:
-    """Return a PNG: a dot for an inlier, a cross for an outlier, a line to where the pose puts its point.
+    """Return a PNG with a dot for each inlier, a cross for each outlier, and a line to its projection.
 
     Args:
-        camera: Whose image is drawn.
-        points_world: ``(n, 3)``, metres.
-        pixels: ``(n, 2)``.
-        inliers: Rows that agree.
+        camera: Camera of the frame.
+        points_world: ``(n, 3)``, points of the matches, metres.
+        pixels: ``(n, 2)``, pixels of the matches.
+        inliers: Indices of the inliers.
         T_camera_world: ``(4, 4)``, the pose; None draws no lines.
-        thumbnail: JPEG of the frame, None for a plain background; one that cannot be read is left out.
+        thumbnail: JPEG of the frame; None, or an image that cannot be decoded, gives a plain background.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -57,7 +61,7 @@ def match_picture(
     if thumbnail is not None:
         try:
             frame = _decode(thumbnail).convert("L").convert("RGB").resize(size)
-            image = image_module.blend(frame, image_module.new("RGB", size, _PALE), 0.35)
+            image = image_module.blend(frame, image_module.new("RGB", size, _WHITE), 0.35)
         except BadRequest:
             pass
     draw = draw_module.Draw(image)
@@ -72,7 +76,7 @@ def match_picture(
     for row in shown[np.argsort(agrees[shown], kind="stable")]:  # inliers on top
         u, v = pixels[row] * scale
         if agrees[row]:
-            draw.ellipse((u - 4, v - 4, u + 4, v + 4), fill=INLIER, outline=_PALE)
+            draw.ellipse((u - 4, v - 4, u + 4, v + 4), fill=INLIER, outline=_WHITE)
         else:
             draw.line((u - 4, v - 4, u + 4, v + 4), fill=OUTLIER, width=2)
             draw.line((u - 4, v + 4, u + 4, v - 4), fill=OUTLIER, width=2)
@@ -84,10 +88,10 @@ def match_picture(
 def _project_near(
     points_world: Array, T_camera_world: Array, camera: Camera
 ) -> tuple[npt.NDArray[np.bool_], Array]:
-    """Return which of the points are projected into or near the image, and the pixels of all."""
+    """Return which points are projected within two image sizes, and the projections ``(n, 2)`` of all, px."""
     with np.errstate(all="ignore"):
         points_camera = transform(T_camera_world, points_world)
-        in_front = points_camera[:, 2] > _NEAR_M
+        in_front = points_camera[:, 2] > _MIN_DEPTH_M
         points_camera[~in_front] = 1.0
         projected = camera.project(points_camera)
     reach = 2.0 * max(camera.width, camera.height)
@@ -95,13 +99,13 @@ def _project_near(
 
 
 def _draw_lines(draw: Any, seen: Array, projected: Array, agrees: npt.NDArray[np.bool_]) -> None:
-    """Draw from each seen pixel of the picture to the projection of its point."""
+    """Draw a line from each observed pixel to the projection of its point, both in pixels of the picture."""
     for (x, y), (u, v), is_inlier in zip(seen, projected, agrees, strict=True):
-        draw.line((x, y, u, v), fill=INLIER if is_inlier else MOVED, width=1)
+        draw.line((x, y, u, v), fill=INLIER if is_inlier else REPROJECTED, width=1)
 
 
 def _decode(thumbnail: bytes) -> Any:
-    """Return the decoded image; raises BadRequest if it is no small JPEG."""
+    """Decode a thumbnail; raises BadRequest if it is too large, or not a JPEG."""
     image_module, _ = _pillow()
     if len(thumbnail) > _MAX_THUMBNAIL_BYTES:
         raise BadRequest(f"a thumbnail of {len(thumbnail)} bytes is too large", hint="record smaller ones")

@@ -1,4 +1,4 @@
-"""All that is known about one recorded command, as one value: what a page, a terminal or a program shows."""
+"""Report one recorded command as one value, from which HTML, terminal output and JSON are made."""
 
 from __future__ import annotations
 
@@ -24,26 +24,27 @@ from rse_pf.wire import Failure, Result
 
 __all__ = ["Attempt", "CommandReport", "Histogram", "report_of"]
 
-_INLIER_PX_TRIED = (2.0, 4.0, 8.0, 16.0)
-_ITERATIONS_TRIED = (100, 1000, 10_000)
+_TRIED_INLIER_PX = (2.0, 4.0, 8.0, 16.0)  # inlier thresholds, px, with which a command is solved again
+_TRIED_ITERATIONS = (100, 1000, 10_000)  # numbers of RANSAC iterations with which it is solved again
+# Edges of the histogram of reprojection errors, px.
 _ERROR_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, math.inf)
-_DEPTH_BINS = 12
-_GRID = (8, 6)
-_MAX_NUMBER = 1e12
-_LIMITS = WeakLimits()
+_DEPTH_BINS = 12  # number of bins of the histogram of depths
+_GRID = (8, 6)  # columns and rows of the cells in which matches are counted
+_MAX_NUMBER = 1e12  # largest absolute value in a report; infinite numbers are replaced by it
+_LIMITS = WeakLimits()  # limits of the rules that decide whether a pose is weak
 
 
 class Attempt(msgspec.Struct, frozen=True, kw_only=True):
-    """What one engine, or one set of options, gives.
+    """The result of solving a command with one engine, or with one changed option.
 
     Attributes:
-        name: Of the engine, or what was changed.
-        verdict: ``ok``, ``weak``, or the code of a failure.
-        reason: Why it is weak, or what the failure says.
-        inliers: How many matches agree.
-        rmse_px: Of those.
-        moved_m: How far the pose is from the recorded one; None where one of the two is missing.
-        moved_deg: The same, of its rotation.
+        name: Name of the engine, or the changed option.
+        verdict: ``ok``, ``weak``, ``not solved``, the code of a failure, or ``answered`` without a pose.
+        reason: Why the pose is weak or the command was not solved, or the message of the failure.
+        inliers: Number of inliers.
+        rmse_px: Root mean square reprojection error of the inliers, px.
+        moved_m: Distance from the recorded position, metres; None if one of the two poses is missing.
+        moved_deg: Rotation from the recorded orientation, degrees; None as above.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Attempt(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Histogram(msgspec.Struct, frozen=True, kw_only=True):
-    """How many inliers and outliers lie between one edge and the next."""
+    """Number of inliers and of outliers in each bin; *n* bins have *n* + 1 edges in ascending order."""
 
     edges: tuple[float, ...]
     inliers: tuple[int, ...]
@@ -64,10 +65,12 @@ class Histogram(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CommandReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One recorded command: what was asked, what was answered, and what is to be learnt from it.
+    """One recorded command: its request and answer, and the results of solving it again.
 
-    ``is_equal`` says whether solving it again, with nothing changed, gave the recorded bytes; ``tried`` what
-    the options of the caller gave.  ``grid`` counts inliers by cell of the image, 8 across and 6 down.
+    ``is_equal`` says whether solving it again with the recorded options gave the recorded bytes; ``tried`` is
+    the result with the options of the caller, ``engines`` and ``options`` those with other engines and
+    options.  ``grid_inliers`` and ``grid_outliers`` are the numbers of matches in 8 x 6 cells of the image,
+    row by row.
     """
 
     id: str
@@ -107,7 +110,10 @@ class CommandReport(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Problem:
-    """The matches of a command, its options, and a pose with its evidence: recorded, or solved again."""
+    """The matches and options of a command, and its pose with inliers and rules: recorded, or solved again.
+
+    ``T_camera_world`` is None, and ``inliers`` empty, if there is no pose.
+    """
 
     points: Array
     pixels: Array
@@ -125,17 +131,17 @@ def report_of(
     *,
     with_picture: bool = True,
 ) -> CommandReport:
-    """Return all that is known about *command*; never raises for what is in it.
+    """Report *command*; contents that cannot be decoded or solved raise nothing.
 
     Args:
-        command: Recorded.
-        resolver: Solves again.
-        overrides: What the caller wants to try.
+        command: The recorded command.
+        resolver: Solves the command again.
+        overrides: Options of the solver to try in addition; None for none.
         with_picture: Whether to draw the matches.
 
     Raises:
-        BadRequest: *overrides* name an engine that there is not.
-        MissingExtra: It is not installed, or Pillow is not.
+        BadRequest: *overrides* name an unknown engine.
+        MissingExtra: That engine, or Pillow for the picture, is not installed.
     """
     overrides = overrides or Overrides()
     again = resolver.again(command)
@@ -199,7 +205,7 @@ def _base(
 
 
 def _read(command: RecordedCommand) -> tuple[Result | Failure | None, str]:
-    """Return the answer and the name of the service, nothing where the bytes cannot be read."""
+    """Return the decoded answer and the name of the service; ``(None, "")`` if they cannot be decoded."""
     try:
         return command.reply, command.command.service
     except RsePfError:
@@ -207,7 +213,10 @@ def _read(command: RecordedCommand) -> tuple[Result | Failure | None, str]:
 
 
 def _problem(command: RecordedCommand, resolver: Resolver, pose: PnpReply | None) -> _Problem | None:
-    """Return the matches of a `pnp` command, None if it is another one or cannot be read."""
+    """Return the matches of a `pnp` command with its pose; None for another service or malformed contents.
+
+    *pose* is the recorded answer; if it is None, the command is solved again.
+    """
     try:
         request = resolver.request(command)
     except RsePfError:
@@ -245,7 +254,10 @@ def _problem(command: RecordedCommand, resolver: Resolver, pose: PnpReply | None
 def _evidence(
     points_world: Array, pixels: Array, request: PnpRequest, options: PnpOptions, pose: Array | str
 ) -> Evidence | None:
-    """Return the evidence of a recorded pose or of that of an engine, None for input that has no pose."""
+    """Return the evidence for *pose*: a recorded pose ``(4, 4)``, or the name of an engine that computes one.
+
+    None if there are too few matches, or if the solver raises an error.
+    """
     if len(pixels) < MIN_CORRESPONDENCES:
         return None
     try:
@@ -290,12 +302,12 @@ def _options(
     tries = [
         *(
             Overrides(engine=chosen, inlier_px=px)
-            for px in _INLIER_PX_TRIED
+            for px in _TRIED_INLIER_PX
             if px != problem.options.inlier_px
         ),
         *(
             Overrides(engine=chosen, max_iterations=most)
-            for most in _ITERATIONS_TRIED
+            for most in _TRIED_ITERATIONS
             if most != problem.options.max_iterations
         ),
     ]
@@ -323,7 +335,7 @@ def _agrees(problem: _Problem) -> npt.NDArray[np.bool_]:
 
 
 def _errors(problem: _Problem) -> Histogram | None:
-    """Return the reprojection errors, which are infinite behind the camera."""
+    """Return the histogram of the reprojection errors, infinite behind the camera; None without a pose."""
     if problem.T_camera_world is None or not len(problem.pixels):
         return None
     with np.errstate(all="ignore"):
@@ -334,7 +346,10 @@ def _errors(problem: _Problem) -> Histogram | None:
 
 
 def _depths(problem: _Problem) -> Histogram | None:
-    """Return the depths of the points before the camera, from the nearest to the farthest twentieth."""
+    """Return the histogram of the points' depths; None without a pose.
+
+    Its inner edges divide the range from the 5th to the 95th percentile.
+    """
     if problem.T_camera_world is None:
         return None
     with np.errstate(all="ignore"):
@@ -359,7 +374,7 @@ def _histogram(values: Array, agrees: npt.NDArray[np.bool_], edges: tuple[float,
 
 
 def _grid(problem: _Problem, *, agrees: bool) -> tuple[int, ...]:
-    """Return how many matches lie in each cell of the image, row after row."""
+    """Return the number of inliers (*agrees*) or outliers in each of 8 x 6 cells of the image, row by row."""
     camera, (columns, rows) = problem.request.camera, _GRID
     pixels = problem.pixels[_agrees(problem) == agrees]
     pixels = pixels[np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < 1e9).all(axis=1)]
@@ -370,7 +385,7 @@ def _grid(problem: _Problem, *, agrees: bool) -> tuple[int, ...]:
 
 
 def _plain(value: float) -> float:
-    """Return *value* as a number that JSON can hold."""
+    """Return *value* as a finite number that JSON can hold: 0 for NaN, at most 1e12 in absolute value."""
     number = float(value)
     if math.isnan(number):
         return 0.0

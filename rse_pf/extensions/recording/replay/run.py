@@ -1,4 +1,4 @@
-"""What a replay does with a recording: list what went wrong, solve everything again, report one command."""
+"""The tasks of a replay: summarise a recording, report one command, and find a command of a log line."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from rse_pf.extensions.recording.summary import Wanted
 
 __all__ = ["Changed", "Overview", "find", "overview", "report"]
 
-_MAX_ROBOTS = 10_000
-_MAX_CHANGED = 1000
-_MAX_RESOLVERS = 16
-_NEAR_S = 5.0
-_LONGEST_S = 10.0
-"""Of a `pnp` command, from its arrival to its answer."""
-_LATEST_S = 9e9
+_MAX_ROBOTS = 10_000  # largest number of robots whose last commands are remembered: bounds the memory
+_MAX_CHANGED = 1000  # largest number of commands with another answer that are listed
+_MAX_RESOLVERS = 16  # largest number of solver settings for which a `Resolver` is kept
+# Largest difference, seconds, between the time of a log line and the recorded time of the answer.
+_MAX_TIME_DIFFERENCE_S = 5.0
+_MAX_ROUND_TRIP_S = 10.0
+"""Longest time, seconds, from the arrival of a `pnp` command to its answer."""
+_MAX_TIME_S = 9e9  # largest Unix time, seconds, that nanoseconds of 63 bits can hold, rounded down
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -37,16 +38,24 @@ class Changed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
-    """What is in a recording.
+    """The summary of a recording.
 
     Attributes:
-        files: How many.
-        cut: Names of files that end within a record, and are read up to there.
-        commands: How many; ``robots`` and ``seconds`` say of whom, and over how long.
-        equal: Solved again with the recorded bytes, but for times and places; 0 where nothing was solved.
-        different: Solved again with others; the first of them are ``changed``.
-        not_solved: Why others could not be solved again, and how many.
-        troubles: What went wrong, worst first; ``by_kind`` counts all.
+        files: Number of files.
+        cut: Names of truncated or damaged files, which were read up to the last complete chunk.
+        version: Version of the software that recorded; "" if unknown.
+        side: ``server`` or ``robot``, whichever recorded; "" if unknown.
+        commands: Number of commands.
+        robots: Number of robots that sent them, up to 10,000.
+        seconds: Time from the first to the last command.
+        left_out: Number of messages that could not be decoded.
+        equal: Number of commands whose new answer has the recorded bytes except for `TIMES_AND_PLACES`.
+        different: Number of commands with another new answer.
+        was_solved: Whether the commands were solved again; else ``equal`` and ``different`` are 0.
+        changed: The first 1000 commands with another new answer.
+        not_solved: Number of the commands that could not be solved again, by reason (the 20 most frequent).
+        troubles: What went wrong with commands, worst first, as many as were asked for.
+        by_kind: Number of all troubles by kind.
     """
 
     files: int
@@ -95,17 +104,17 @@ def overview(
     overrides: Overrides | None = None,
     worst: int = 20,
 ) -> Overview:
-    """Return what is in the recording at *path*, and what went wrong.
+    """Summarise the recording at *path*, and what went wrong with its commands.
 
     Args:
-        path: A file or a folder.
-        settings: The limits of messages; those of the solver are taken from the recording.
+        path: A file or a folder of files.
+        settings: Settings with the limits of messages; those of the solver are taken from the recording.
         solve: Whether to solve every command again.
-        overrides: What to try instead of what was asked for.
-        worst: How many troubles are told.
+        overrides: Options of the solver that replace the recorded ones; None for the recorded ones.
+        worst: Largest number of troubles that are returned.
 
     Raises:
-        RsePfError: The recording cannot be read, or *overrides* name an engine that is not there.
+        RsePfError: The recording cannot be read, or *overrides* name an engine that is not installed.
     """
     recording = open_recording(path, settings.session)
     resolvers = _Resolvers(settings)
@@ -122,7 +131,7 @@ def overview(
         last_s = command.sent_s if last_s is None else max(last_s, command.sent_s)
         if command.robot not in robots and len(robots) >= _MAX_ROBOTS:
             robots.pop(next(iter(robots)))
-        trouble = robots.setdefault(command.robot, RobotHistory()).judge(command)
+        trouble = robots.setdefault(command.robot, RobotHistory()).classify(command)
         if trouble is not None:
             by_kind[trouble.kind] += 1
             troubles.add(trouble)
@@ -157,11 +166,18 @@ def report(
     *,
     with_picture: bool = True,
 ) -> CommandReport:
-    """Return all that is known about the command *identity*, as `WireRecording.find` takes it.
+    """Report the command *identity*, which is an id as `WireRecording.find` expects it.
+
+    Args:
+        path: A file or a folder of files.
+        settings: Settings with the limits of messages; those of the solver are taken from the recording.
+        identity: ``CONNECTION:ID``, or ``ID`` alone if it is unique.
+        overrides: Options of the solver to try in addition; None for none.
+        with_picture: Whether to draw the matches.
 
     Raises:
         RsePfError: The recording cannot be read, has no such command, or *overrides* name an engine that is
-            not there.
+            not installed.
     """
     recording = open_recording(path, settings.session)
     command = recording.find(identity)
@@ -177,20 +193,21 @@ def find(
     near_s: float | None = None,
     command_bytes: int | None = None,
 ) -> str:
-    """Return ``CONNECTION:ID`` of a command that a server's log tells of, "" if there is none.
+    """Return ``CONNECTION:ID`` of a command that a line of a server's log describes, "" if there is none.
 
     Args:
-        path: A file or a folder.
-        settings: The limits of messages.
-        trace: Of the command; many robots send none.
-        number: Its id, which every connection counts on its own.
-        near_s: When it was answered, Unix time: the nearest within 5 s is taken; None for the newest.
-        command_bytes: The length of its message, None where it is not known.
+        path: A file or a folder of files.
+        settings: Settings with the limits of messages.
+        trace: Trace of the command, "" for a robot that sends none.
+        number: Id of the command; other connections may have a command with the same id.
+        near_s: Unix time of the answer; of several commands the one answered nearest to it, within 5 s, is
+            returned.  None returns the newest one.
+        command_bytes: Size of the message of the command; None if unknown.
     """
-    nearest, nearest_s = "", _NEAR_S
+    nearest, nearest_s = "", _MAX_TIME_DIFFERENCE_S
     wanted = None
-    if near_s is not None and 0.0 < near_s < _LATEST_S:
-        begin_s, end_s = near_s - _NEAR_S - _LONGEST_S, near_s + _NEAR_S
+    if near_s is not None and 0.0 < near_s < _MAX_TIME_S:
+        begin_s, end_s = near_s - _MAX_TIME_DIFFERENCE_S - _MAX_ROUND_TRIP_S, near_s + _MAX_TIME_DIFFERENCE_S
         wanted = Wanted(begin_ns=round(1e9 * begin_s), end_ns=round(1e9 * end_s))
     for command in open_recording(path, settings.session).commands(wanted):
         if not command.id.endswith(f":{number}") or command_bytes not in (None, len(command.command_bytes)):
@@ -201,14 +218,14 @@ def find(
             continue
         try:
             if command.command.trace == trace:
-                nearest, nearest_s = command.id, apart_s if near_s is not None else _NEAR_S
+                nearest, nearest_s = command.id, apart_s if near_s is not None else _MAX_TIME_DIFFERENCE_S
         except RsePfError:
             continue
     return nearest
 
 
 class _Resolvers:
-    """What solves with the numbers of the server that recorded, as far as its file says them."""
+    """Resolvers with the solver settings that the file of a command states, else with the defaults."""
 
     def __init__(self, settings: PlatformSettings) -> None:
         self._settings = settings
@@ -224,7 +241,7 @@ class _Resolvers:
 
 
 def _pnp_settings(text: str) -> dict[str, Any]:
-    """Return the settings of the solver that *text* says, the defaults where it says none."""
+    """Return the solver settings in the JSON *text*; defaults for missing ones, or if *text* is invalid."""
     defaults = dataclasses.asdict(PnpSettings())
     try:
         recorded = msgspec.json.decode(text, type=dict[str, Any])

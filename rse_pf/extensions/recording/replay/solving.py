@@ -1,7 +1,7 @@
-"""Solve a recorded command again, and compare the answer with the recorded one to the byte.
+"""Solve a recorded command again, and compare the answer with the recorded one byte by byte.
 
-Commands go the way of every server, the Lambda and the robot: decoded by the same codec, answered by
-`rse_pf.service.dispatch`, encoded by the same codec.
+As in servers, in the Lambda function and in robots, a command is decoded by the codec of its connection,
+answered by `rse_pf.service.dispatch`, and its answer is encoded by the same codec.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from rse_pf.wire import Codec, Command, Failure, Result, as_type, make_codec
 __all__ = ["TIMES_AND_PLACES", "Again", "Overrides", "Resolver", "pnp_reply", "solver_codes"]
 
 TIMES_AND_PLACES = ("server", "queue_ms", "compute_ms", "received_s", "sent_s", "trace")
-"""Fields of answers that say when, where and for whom, which differ whenever a command is solved again."""
+"""Fields of answers with times, server and trace, which are not compared: they differ each time."""
 _MAX_TRIED_ITERATIONS = 100_000  # as many as options can ask for; a server allows fewer
 _POSES_SERVICE = "pnp"
 
 
 class Overrides(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What is to be tried instead of what the command asked for; None keeps it."""
+    """Options of the solver that replace those of a recorded command; None keeps the recorded option."""
 
     engine: str | None = None
     inlier_px: float | None = None
@@ -48,24 +48,27 @@ class Overrides(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def changes(self) -> bool:
-        """Whether anything differs from what was recorded."""
+        """Whether any option replaces a recorded one."""
         return self != Overrides()
 
     def of(self, options: PnpOptions | None) -> PnpOptions:
-        """Return *options* with what is to be tried; raises BadRequest if a number is out of its range."""
+        """Return *options* (None for the defaults) with the replaced ones.
+
+        Raises BadRequest if a number is out of range.
+        """
         given = {name: value for name, value in msgspec.structs.asdict(self).items() if value is not None}
         return msgspec.structs.replace(options or PnpOptions(), **given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Again:
-    """What became of a command that was solved again.
+    """The result of solving a recorded command again.
 
     Attributes:
-        answer: The new one, None if the command cannot be solved again.
-        why_not: Why it cannot, "" if it can.
-        is_equal: Whether the answer has the recorded bytes, but for `TIMES_AND_PLACES`.
-        difference: What differs, in words.
+        answer: The new answer; None if the command cannot be solved again.
+        why_not: Why the command cannot be solved again; "" if it can.
+        is_equal: Whether the new answer has the recorded bytes except for `TIMES_AND_PLACES`.
+        difference: Phrase on how the new answer differs; "" if it is equal.
     """
 
     answer: Result | Failure | None = None
@@ -75,7 +78,7 @@ class Again:
 
 
 class Resolver:
-    """Solves recorded commands again, with the engine that solved them."""
+    """Solve recorded commands again, with the engine that solved them first."""
 
     def __init__(
         self, settings: PlatformSettings | None = None, *, clock: Callable[[], float] = time.perf_counter
@@ -83,8 +86,8 @@ class Resolver:
         """Prepare to solve.
 
         Args:
-            settings: Those of the server that answered; None for the defaults.
-            clock: Seconds; how long an answer took.
+            settings: Settings of the server that answered; None for the defaults.
+            clock: Clock in seconds with which the time of an answer is measured.
         """
         self._settings = settings or PlatformSettings()
         self._clock = clock
@@ -95,26 +98,28 @@ class Resolver:
 
     @property
     def engines(self) -> tuple[str, ...]:
-        """The engines that this machine has."""
+        """Names of the PnP engines that are installed on this machine."""
         return self._engines
 
     @property
     def default_engine(self) -> str:
-        """The engine of the server that recorded, or one that this machine has."""
+        """The engine in the settings of the server, or the first installed one if it is not installed."""
         preferred = self._settings.pnp.engine
         return preferred if preferred in self._engines else self._engines[0]
 
     def again(self, recorded: RecordedCommand, overrides: Overrides | None = None) -> Again:
-        """Solve *recorded* again; never raises for what is in it.
+        """Solve *recorded* again, with the options of *overrides* if it is a `pnp` command.
+
+        Contents of *recorded* that cannot be decoded or solved raise nothing: `Again.why_not` is the reason.
 
         Raises:
-            BadRequest: *overrides* name an engine that there is not.
-            MissingExtra: It is not installed.
-            ConfigurationError: Its library does not fit.
+            BadRequest: *overrides* name an unknown engine.
+            MissingExtra: That engine is not installed.
+            ConfigurationError: The library of that engine has a wrong version.
         """
         overrides = overrides or Overrides()
         if overrides.engine is not None and overrides.engine not in self._engines:
-            engine_for(overrides.engine)  # which says what is missing
+            engine_for(overrides.engine)  # raises an error that names what is missing
         try:
             reply = recorded.reply
             command = self.decoded(recorded)
@@ -145,7 +150,10 @@ class Resolver:
         return message
 
     def request(self, recorded: RecordedCommand) -> PnpRequest | None:
-        """Return the matches of a `pnp` command, None if it is another one; raises RsePfError."""
+        """Return the decoded request of a `pnp` command; None for another service.
+
+        Raises RsePfError if it cannot be decoded.
+        """
         command = self.decoded(recorded)
         if command.service != _POSES_SERVICE:
             return None
@@ -153,7 +161,7 @@ class Resolver:
         return request
 
     def _why_not(self, command: Command, reply: Result | Failure | None) -> str:
-        """Return why *command* cannot be solved again, "" if it can."""
+        """Return why *command*, which was answered by *reply*, cannot be solved again; "" if it can."""
         service = next((s for s in self._registry(self._engines[0]) if s.name == command.service), None)
         if service is None:
             return "its service is installed on the server"
@@ -166,7 +174,7 @@ class Resolver:
         return ""
 
     def _engine_of(self, command: Command, reply: Result | Failure | None) -> str:
-        """Return which engine solved *command*, or would have."""
+        """Return the engine that the recorded *reply* names, else `default_engine`."""
         if command.service == _POSES_SERVICE and isinstance(reply, Result) and isinstance(reply.reply, dict):
             engine = reply.reply.get("engine", "")
             if isinstance(engine, str) and engine:
@@ -189,7 +197,7 @@ class Resolver:
         )
 
     def _registry(self, engine: str) -> Registry:
-        """Return the services of a server with *engine*."""
+        """Return the built-in services of a server that uses *engine*."""
         if engine not in self._registries:
             self._registries[engine] = builtin_services(self._settings.replace(pnp={"engine": engine}))
         return self._registries[engine]
@@ -200,20 +208,23 @@ class Resolver:
         return self._codecs[name]
 
     def _bytes_of(self, codec: str, answer: Result | Failure, recorded: Result | Failure) -> bytes | None:
-        """Return *answer* as it would have been sent then; None if it is of another kind."""
+        """Encode *answer* with the `TIMES_AND_PLACES` of *recorded*, before it is deflated.
+
+        None if one of the two is a result and the other a failure.
+        """
         if type(answer) is not type(recorded):
             return None
         unchanged = {name: getattr(recorded, name) for name in TIMES_AND_PLACES if hasattr(recorded, name)}
         return self._text(codec, self._codec(codec).encode(msgspec.structs.replace(answer, **unchanged)))
 
     def _text(self, codec: str, data: bytes | None) -> bytes:
-        """Return the bytes of a message before it was deflated: how tightly it is says nothing of a pose."""
+        """Inflate a message of the codec ``zlib``, since versions may deflate differently; return others."""
         assert data is not None
         return bytes(inflate_within(data, self._budget)) if codec == "zlib" else data
 
 
 def pnp_reply(answer: Result | Failure | None) -> PnpReply | None:
-    """Return the pose of *answer*, None if it holds none."""
+    """Return the reply of the service `pnp` in *answer*; None if it holds none, or arrays of a wrong size."""
     if not isinstance(answer, Result):
         return None
     if isinstance(answer.reply, PnpReply):
@@ -227,13 +238,16 @@ def pnp_reply(answer: Result | Failure | None) -> PnpReply | None:
 
 
 def solver_codes() -> frozenset[str]:
-    """Return the codes of failures that depend on nothing but the command."""
+    """Return the codes of failures that depend on the command alone, and so occur again."""
     kinds: list[type[RsePfError]] = [PnpError, *PnpError.__subclasses__(), BadRequest, LimitExceeded]
     return frozenset(kind.code for kind in kinds)
 
 
 def difference_of(before: Result | Failure, after: Result | Failure) -> str:
-    """Return in words how *after* differs from *before*, "" if it does not in what words tell."""
+    """Return a phrase on how *after* differs from *before*.
+
+    It compares codes of failures, pose, verdict, number of inliers and engine; "" if these are equal.
+    """
     if isinstance(before, Failure) and isinstance(after, Failure):
         return "" if before.code == after.code else f"{before.code} became {after.code}"
     if isinstance(before, Failure):
