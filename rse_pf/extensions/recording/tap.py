@@ -28,10 +28,14 @@ __all__ = [
     "split_decoded_command",
 ]  # fmt: skip
 
-OPENED, UP, DOWN, CLOSED, LOST, DECODED_COMMAND, ANSWER_WITH_POSE = 1, 2, 3, 4, 5, 6, 7
-"""Kinds of the entries that a worker writes to the recorder: a connection was opened, a message was received
-from a robot (up) or sent to it (down), a connection was closed, messages were lost, a command whose id and
-texts precede the message, an answer whose command id and pose precede the message."""
+# Kinds of the entries that a worker writes to the recorder:
+OPENED = 1  # a connection was opened
+UP = 2  # a message was received from a robot
+DOWN = 3  # a message was sent to a robot
+CLOSED = 4  # a connection was closed
+LOST = 5  # messages were dropped; the data are their total number
+DECODED_COMMAND = 6  # as UP, for a command: its id and texts precede the message
+ANSWER_WITH_POSE = 7  # as DOWN, for a result with a pose: command id and pose precede the message
 _ENTRY = struct.Struct("<BIQI")
 """Head of an entry: its kind, the number of the connection, the Unix time in ns, and the number of bytes of
 data that follow."""
