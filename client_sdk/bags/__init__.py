@@ -1,6 +1,6 @@
-"""ROS bags without ROS: ROS 1 bag, ROS 2 sqlite3 and ROS 2 MCAP as frames, and maps written as bags.
+"""Read ROS bags (ROS 1 bag, ROS 2 sqlite3, ROS 2 MCAP) as frames, and write maps as bags, without ROS.
 
-What knows a message of ROS belongs here; what a robot does with a frame does not.
+All code that depends on ROS message types is in this package.
 """
 
 from client_sdk.bags.bag import Bag, BagOptions, open_bag

@@ -1,7 +1,7 @@
-"""Open a ROS bag as frames: undistorted, registered, in the order of their time stamps.
+"""Open a ROS bag as frames, with undistorted or rectified images and registered depth, in the order of time.
 
 The bag is read twice: once for its time stamps, transforms and broken messages, and once for the images, of
-which only those that wait for their partner are in memory.
+which few are in memory at a time.
 """
 
 from __future__ import annotations
@@ -65,37 +65,44 @@ from rse_pf.geometry import Array, Camera, Lens, inverse
 
 __all__ = ["Bag", "BagOptions", "open_bag"]
 
-_USUAL_DEPTH_SCALE = 1000.0  # units of 16-bit depth in a metre: millimetres (REP 118)
-_SAME_VIEW = 0.01  # focal lengths and principal points of one view differ by less of the image's size
-_MOST_CHANGES = 5  # of the stated camera that are compared with the images; an autofocus changes it always
-_MISMATCH_PX = 3.0  # a change of the camera that the images contradict misses by more than this
-_MISMATCH_RATIO = 2.0  # and by more than this times what an unchanged camera misses by
+_USUAL_DEPTH_SCALE = 1000.0  # units per metre of 16-bit depth if nothing is stated: millimetres (REP 118)
+# Largest difference of focal lengths and principal points, as a share of the image's size, of two cameras
+# with the same view.
+_MAX_VIEW_DIFFERENCE = 0.01
+# Largest number of changes of the stated camera that are compared with images; an autofocus causes many.
+_MAX_CHECKED_CHANGES = 5
+# A change of the camera is contradicted if its error in the images exceeds that of no change by this many px,
+_MIN_MISMATCH_PX = 3.0
+_MIN_MISMATCH_RATIO = 2.0  # and is also above this many times the error of no change
 _ESTIMATED_FRAMES = {"odom", "map"}
-"""Roots of tf whose poses another SLAM system or an odometry estimated."""
+"""Root frames of tf whose poses come from an odometry or another SLAM system, and are no ground truth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagOptions:
-    """How a bag is read; a topic that is not named is found by its type.
+    """Options of reading a bag; a topic that is None is chosen by its type and name.
 
     Attributes:
-        colour: Topic of the colours; of a stereo pair, the left camera.
-        depth: Topic of the depth.
+        colour: Topic of the colour images, or of the left camera of a stereo pair.
+        depth: Topic of the depth images.
         right: Topic of the right camera of a stereo pair.
-        info: Topic of the camera of the colours.
+        info: ``CameraInfo`` topic of the colour images.
         truth: Topic of true poses: PoseStamped, PoseWithCovarianceStamped or Odometry.
         imu: Topic of the IMU.
-        lens: The camera, instead of that in the bag.
-        rig: The cameras of a stereo pair, or the one camera, and the IMU, instead of those in the bag.
-        depth_scale: Units of depth in a metre; None takes what the bag states, else 1000 of 16 bits and 1 of
-            32 bits.
-        pair_within_s: Colour and depth, or left and right, belong together up to this difference of stamps.
-        use_depth: False leaves the depth out, and takes one camera unless *right* is named.
-        use_stereo: None takes a pair where there is no depth; True takes it always, False its left camera.
-        use_imu: None takes an IMU where it can be used; True refuses a bag without one, False takes none.
+        lens: Lens of the colour camera that replaces the one in the bag.
+        rig: Rig of one camera or of a stereo pair, and the IMU, that replaces those in the bag.
+        depth_scale: Units of depth per metre.  None uses the unit that the bag states, else 1000 for 16-bit
+            depth and 1 for floats.
+        pair_within_s: Largest difference of the time stamps, seconds, of the colour and the depth image of a
+            frame, or of its left and right image.
+        use_depth: False uses neither depth nor a stereo pair, unless *right* is named.
+        use_stereo: True uses a stereo pair even if there is depth; False uses only the left camera of a pair;
+            None uses a pair if there is no depth.
+        use_imu: None uses the IMU if it can be used; True refuses a bag without a usable IMU; False uses
+            none.
 
     Raises:
-        UsageError: A number is not above 0.
+        UsageError: *depth_scale* or *pair_within_s* is not above 0.
     """
 
     colour: str | None = None
@@ -120,11 +127,21 @@ class BagOptions:
 
 @dataclass(slots=True, eq=False)
 class Bag(AutoClose):
-    """The frames of a bag: iterate over it, or read one by its row; close it, or use it in ``with``.
+    """The frames of an open bag: iterate over it, or `read` single frames; close it, or use it in ``with``.
 
-    Frames that are iterated over carry the samples of ``imu``; those that are read do not.
-    ``notes`` are sentences for the user: which topics were taken, and what was left out.  ``truth_kind`` is
-    ``reference`` for poses that another program estimated.  ``log`` has what is unlikely about the bag.
+    Frames of the iteration have the samples of ``imu`` since the frame before; those of `read` have none.
+
+    Attributes:
+        name: Name of the file or folder.
+        camera: Pinhole camera of all frames; the rectified left one for a stereo pair.
+        timestamps_s: Ascending time stamps of the frames, s.
+        has_depth: Whether frames have depth.
+        truth: Trajectory of the camera with which an estimate can be compared; None if there is none.
+        truth_kind: ``ground truth``, ``reference`` for poses that another program estimated, or ``none``.
+        notes: Sentences for the user on the topics that are used, and on what was assumed.
+        chosen: The topics that are used.
+        imu: All samples of the IMU; None without an IMU.
+        log: Doubts about the bag: unlikely facts, and messages that were left out.
     """
 
     name: str
@@ -140,8 +157,8 @@ class Bag(AutoClose):
     _file: BagFile
     _stream: ImageStream
     _pairs: tuple[_Pair, ...]
-    _colour_way: _Way
-    _depth_way: _Way
+    _colour_rectifier: _TopicRectifier
+    _depth_rectifier: _TopicRectifier
     _depth_scale: float
     _is_float_depth: bool = False
     _registration: tuple[Camera, Array] | None = None
@@ -150,7 +167,7 @@ class Bag(AutoClose):
 
     @property
     def has_stereo(self) -> bool:
-        """Whether frames are stereo pairs; then the camera is the rectified left one."""
+        """Whether frames have the right image of a stereo pair; ``camera`` is then the rectified left one."""
         return self._rectification is not None
 
     def __len__(self) -> int:
@@ -160,7 +177,7 @@ class Bag(AutoClose):
         return with_imu(map(self.read, range(len(self))), self.imu)
 
     def read(self, row: int) -> Frame:
-        """Return a frame; rows in ascending order are read without seeking.
+        """Return the frame with the index *row*; frames in ascending order are read without seeking.
 
         Raises:
             UsageError: The image cannot be decoded.
@@ -171,7 +188,7 @@ class Bag(AutoClose):
             colours = decode_colour(self._file.parse(raw[0]))
             if self._rectification is not None:
                 return self._stereo_frame(row, self._rectification, colours, raw[1])
-            rgb = self._colour_way.of(pair[0]).colour(colours)
+            rgb = self._colour_rectifier.of(pair[0]).colour(colours)
             depth_m = self._depth_of(pair, raw)
         except BrokenMessage as error:
             raise UsageError(
@@ -201,7 +218,7 @@ class Bag(AutoClose):
             depth_m = decode_depth(message, 1.0) / np.float32(self._depth_scale)
         else:
             depth_m = decode_depth(message, self._depth_scale)
-        depth_m = self._depth_way.of(pair[1]).depth(depth_m)
+        depth_m = self._depth_rectifier.of(pair[1]).depth(depth_m)
         if self._registration is None:
             return depth_m
         return register_depth(depth_m, *self._registration, self.camera)
@@ -213,10 +230,13 @@ class Bag(AutoClose):
 
 
 def open_bag(path: Path | str, options: BagOptions | None = None) -> Bag:
-    """Open a ROS 1 bag, or a ROS 2 bag as sqlite3 or MCAP; images are read later.
+    """Open a ROS 1 bag, or a ROS 2 bag in sqlite3 or MCAP; images are read later.
+
+    The bag is read once for its time stamps, which takes a while for a large one.
 
     Raises:
-        UsageError: The bag, or a topic, a camera or a depth image that fits is missing or cannot be used.
+        UsageError: The bag cannot be read, a topic or calibration is missing or cannot be used, or facts
+            contradict each other.
         MissingExtra: ``rosbags`` or OpenCV is not installed.
     """
     options = options or BagOptions()
@@ -250,8 +270,8 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
     rectification, T_left_camera = _rectification(file, chosen, formats, index, options)
     lens = _usual_lens(lenses, times, index.colour)
     camera = lens.camera if rectification is None else rectification.camera
-    pairs, stamps_ns = _pairs(name, index, chosen, options)
-    depth_way, registration, doubts = _depth_way(file, chosen, formats, lenses, lens, times, index)
+    pairs, stamps_ns = _pair_images(name, index, chosen, options)
+    depth_rectifier, registration, doubts = _prepare_depth(file, chosen, formats, lenses, lens, times, index)
     truth, truth_kind, truth_note = _truth(chosen, formats, index, stamps_ns)
     if truth is not None:
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ T_left_camera)
@@ -285,8 +305,8 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         _file=file,
         _stream=stream,
         _pairs=tuple(pairs),
-        _colour_way=_Way(times, [map_to_pinhole(each, lens.camera) for each in lenses]),
-        _depth_way=depth_way,
+        _colour_rectifier=_TopicRectifier(times, [map_to_pinhole(each, lens.camera) for each in lenses]),
+        _depth_rectifier=depth_rectifier,
         _depth_scale=depth_scale,
         _is_float_depth=is_float,
         _registration=registration,
@@ -300,8 +320,8 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
             bag, is_unit_stated=is_float or unit_m is not None or options.depth_scale is not None
         ),
         times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(bag.timestamps_s))],
-        losses=tuple(_losses(index, pairs, chosen, options)),
-        doubts=(*doubts, *_changes(chosen, lenses, lens)),
+        losses=tuple(_loss_facts(index, pairs, chosen, options)),
+        doubts=(*doubts, *_change_doubts(chosen, lenses, lens)),
     )
     bag.notes += facts.notes
     _check_changes(bag, lenses, times)
@@ -310,30 +330,34 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
 
 
 _Pair = tuple[tuple[str, int, int], ...]
-"""Of each image of a frame: topic, stamp of the message, and when it was written, nanoseconds."""
+"""The images of a frame, one or two: for each its topic, the stamp of the message, and the time of writing,
+both in nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Way:
-    """How images of a topic become those of the camera, whose lens may change in the drive."""
+class _TopicRectifier:
+    """The undistortion of the images of a topic, whose lens may change during the drive.
+
+    ``rectifiers`` has one map to pixels of the pinhole camera for each message of ``times``.
+    """
 
     times: CameraTimes
     rectifiers: Sequence[ImageMap]
 
     def of(self, image: tuple[str, int, int]) -> ImageMap:
-        """Return what rectifies an image."""
+        """Return the map that undistorts an image, given as topic, stamp and time of writing."""
         _, stamp_ns, log_ns = image
         return self.rectifiers[self.times.row_at(stamp_ns, log_ns) if len(self.rectifiers) > 1 else 0]
 
 
 def _depth_facts(bag: Bag, *, is_unit_stated: bool) -> DepthFacts | None:
-    """Return the median depth of some frames of a bag."""
+    """Return the median depth of the first, middle and last frame with its unit; None without depth."""
     if not bag.has_depth:
         return None
     rows = sorted({round(share * (len(bag) - 1)) for share in (0.0, 0.5, 1.0)})
     depths_m = []
     for row in rows:
-        with contextlib.suppress(UsageError):  # of a message that cannot be decoded, when it is its turn
+        with contextlib.suppress(UsageError):  # an image that cannot be decoded is reported when it is used
             depths_m.append(bag.read(row).depth_m)
     return DepthFacts(
         median_m=median_depth_m(depths_m), units_per_m=bag._depth_scale, is_unit_stated=is_unit_stated
@@ -346,8 +370,8 @@ def _stated_by(chosen: ChosenTopics, options: BagOptions) -> str:
     return "the file of intrinsics"
 
 
-def _changes(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> tuple[Doubt, ...]:
-    """Return a doubt about a camera that changes in the drive."""
+def _change_doubts(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> tuple[Doubt, ...]:
+    """Return a doubt if the bag states several calibrations of the colour camera; empty for one."""
     if len(lenses) < 2 or chosen.colour_info is None:
         return ()
     focal = ", ".join(f"{each.camera.fx:g}" for each in lenses)
@@ -360,16 +384,16 @@ def _changes(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> tuple[
 
 
 def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None:
-    """Refuse cameras of which the images around a change say that it was none: one of both is wrong.
+    """Compare the images before and after each stated change of the camera, up to five of them.
 
     Raises:
-        UsageError: The images contradict the change.
+        UsageError: The images show that the lens did not change: one of the two calibrations is wrong.
     """
     if len(lenses) < 2:
         return
     valid = [times.row_at(stamp_ns, log_ns) for (_, stamp_ns, log_ns), *_ in bag._pairs]
     changes = [row for row in range(1, len(valid)) if valid[row] != valid[row - 1]]
-    for row in changes[:_MOST_CHANGES]:
+    for row in changes[:_MAX_CHECKED_CHANGES]:
         lens, other = lenses[valid[row - 1]], lenses[valid[row]]
         try:
             images = [decode_colour(bag._file.parse(bag._stream.take(bag._pairs[each])[0]))
@@ -380,7 +404,7 @@ def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None
         if mismatches_px is None:
             continue
         changed_px, unchanged_px = mismatches_px
-        if changed_px > max(_MISMATCH_RATIO * unchanged_px, unchanged_px + _MISMATCH_PX):
+        if changed_px > max(_MIN_MISMATCH_RATIO * unchanged_px, unchanged_px + _MIN_MISMATCH_PX):
             topic = _stated_by(bag.chosen, BagOptions())
             raise UsageError(
                 f"{topic} states fx {lens.camera.fx:g} before {bag.timestamps_s[row]:.3f} s and "
@@ -393,7 +417,11 @@ def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None
 def _unit_note(
     unit_m: float | None, options: BagOptions, depth_scale: float, depth: Topic | None
 ) -> tuple[str, ...]:
-    """Return what is said about the unit of *depth*, None for floats, which are metres by REP 118."""
+    """Return a sentence on the unit of depth, if the bag states one or if one is assumed; else nothing.
+
+    *unit_m* is the stated unit in metres, or None.  *depth* is the topic of 16-bit depth; None for floats,
+    which are metres by REP 118.
+    """
     if unit_m is not None:
         used = "" if options.depth_scale is None else f", but depth_scale {depth_scale:g} is used"
         return (f"the recorder states depth in units of {1000.0 * unit_m:g} mm{used}",)
@@ -410,13 +438,13 @@ def _registration_note(chosen: ChosenTopics, registration: tuple[Camera, Array] 
 
 
 def _first_messages(file: BagFile) -> tuple[dict[str, ImageFormat], dict[str, str]]:
-    """Return what the images of each topic are, and the frames of the cameras."""
+    """Return the formats of all image topics, and the frames of all ``CameraInfo`` topics, by name."""
     formats: dict[str, ImageFormat] = {}
     infos: dict[str, str] = {}
     for topic in file.topics:
         if topic.kind not in (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO) or not topic.messages:
             continue
-        for raw in _some(file, topic.name):
+        for raw in _first_raw_messages(file, topic.name):
             try:
                 message = file.parse(raw)
                 if topic.kind == CAMERA_INFO:
@@ -429,8 +457,8 @@ def _first_messages(file: BagFile) -> tuple[dict[str, ImageFormat], dict[str, st
     return formats, infos
 
 
-def _some(file: BagFile, topic: str) -> Iterator[RawMessage]:
-    """Yield the first messages of a topic: enough to find one that is not broken."""
+def _first_raw_messages(file: BagFile, topic: str) -> Iterator[RawMessage]:
+    """Yield the first ten messages of a topic, among which a valid one is searched."""
     try:
         for number, raw in enumerate(file.messages([topic])):
             if number >= 10:
@@ -443,7 +471,7 @@ def _some(file: BagFile, topic: str) -> Iterator[RawMessage]:
 def _lenses_of_colour(
     file: BagFile, chosen: ChosenTopics, index: BagIndex, options: BagOptions, formats: dict[str, ImageFormat]
 ) -> tuple[list[Lens], CameraTimes]:
-    """Return the lenses of the colours, and when each of them is valid; nearly always there is one."""
+    """Return the different lenses of the colour camera, usually one, and when each of them is valid."""
     info = chosen.colour_info
     if options.lens is not None or options.rig is not None:
         lens = options.lens if options.rig is None else options.rig.left.lens
@@ -465,7 +493,7 @@ def _lenses_of_colour(
 
 
 def _usual_lens(lenses: Sequence[Lens], times: CameraTimes, images: ImageStamps) -> Lens:
-    """Return the lens of most images."""
+    """Return the lens that is valid for most images."""
     rows = [times.row_at(int(s), int(log)) for s, log in zip(images.header_ns, images.log_ns, strict=True)]
     return lenses[Counter(rows).most_common(1)[0][0]] if rows and len(lenses) > 1 else lenses[0]
 
@@ -487,7 +515,11 @@ def _rectification(
     index: BagIndex,
     options: BagOptions,
 ) -> tuple[Rectification | None, Array]:
-    """Return how a pair is rectified, and ``(4, 4)`` its left camera's pose in the one as it is."""
+    """Return the rectification of a stereo pair, None for one camera, and ``T_left_camera`` ``(4, 4)``.
+
+    ``T_left_camera`` is the pose of the camera of the frames (the rectified left one) in the left camera of
+    the bag; the identity for one camera.
+    """
     if chosen.right is None:
         return None, np.eye(4)
     if options.rig is not None:
@@ -536,10 +568,14 @@ def _pair_of_bag(
     return pair
 
 
-def _pairs(
+def _pair_images(
     name: str, index: BagIndex, chosen: ChosenTopics, options: BagOptions
 ) -> tuple[list[_Pair], list[int]]:
-    """Return what each frame is made of, and its stamp."""
+    """Return the images of each frame, one or two, and the time stamp of each frame, nanoseconds.
+
+    Each colour or left image is paired with the depth or right image that is nearest in time; images without
+    a partner within ``pair_within_s`` are left out.
+    """
     colour, second = index.colour, index.second
     topic, partner_topic = chosen.colour.name, chosen.second
     if not len(colour.stamps_ns) or not len(second.stamps_ns):
@@ -570,7 +606,7 @@ def _partner(chosen: ChosenTopics) -> str:
     return "depth" if chosen.right is None else "a right one"
 
 
-def _depth_way(
+def _prepare_depth(
     file: BagFile,
     chosen: ChosenTopics,
     formats: Mapping[str, ImageFormat],
@@ -578,11 +614,15 @@ def _depth_way(
     lens: Lens,
     times: CameraTimes,
     index: BagIndex,
-) -> tuple[_Way, tuple[Camera, Array] | None, tuple[Doubt, ...]]:
-    """Return how depth images become those of the colour camera: rectified, registered, and doubts."""
+) -> tuple[_TopicRectifier, tuple[Camera, Array] | None, tuple[Doubt, ...]]:
+    """Return the undistortion of depth images, the registration to the colour camera, and doubts.
+
+    The registration is the depth camera and ``T_colour_depth``; it is None if the depth has the pixels of the
+    colour image already, or if that is assumed, which is then a doubt.
+    """
     camera, depth = lens.camera, chosen.depth
     if depth is None:
-        return _Way(times, [ImageMap(None)]), None, ()
+        return _TopicRectifier(times, [ImageMap(None)]), None, ()
     info, image, colours = chosen.depth_info, formats[depth.name], formats[chosen.colour.name]
     own_times = CameraTimes() if info is None else index.cameras[info.name]
     own = [
@@ -592,7 +632,7 @@ def _depth_way(
     ]
     if any(image.size not in (None, (each.camera.width, each.camera.height)) for each in own):
         own = []
-    like_colours = _Way(times, [map_to_pinhole(each, camera) for each in lenses])
+    colour_rectifier = _TopicRectifier(times, [map_to_pinhole(each, camera) for each in lenses])
     T_colour_depth = stated_T_colour_depth(file, chosen.colour.name, depth.name)
     if T_colour_depth is None and is_registered(depth):
         T_colour_depth = np.eye(4)
@@ -602,11 +642,11 @@ def _depth_way(
         T_colour_depth = np.eye(4)
     is_same_size = image.size in (None, (camera.width, camera.height))
     if T_colour_depth is not None and is_same_size and np.allclose(T_colour_depth, np.eye(4), atol=1e-6):
-        own_way = _Way(own_times, [map_to_pinhole(each, camera) for each in own])
-        return own_way if own else like_colours, None, ()
+        own_rectifier = _TopicRectifier(own_times, [map_to_pinhole(each, camera) for each in own])
+        return own_rectifier if own else colour_rectifier, None, ()
     if T_colour_depth is not None and own:
         return (
-            _Way(own_times, [map_to_pinhole(each, own[0].camera) for each in own]),
+            _TopicRectifier(own_times, [map_to_pinhole(each, own[0].camera) for each in own]),
             (own[0].camera, T_colour_depth),
             (),
         )
@@ -625,24 +665,27 @@ def _depth_way(
         hint="record the registered (aligned) depth topic of your driver, or /tf_static",
     )
     if own:
-        return _Way(own_times, [map_to_pinhole(each, camera) for each in own]), None, (doubt,)
-    return like_colours, None, (doubt,)
+        return _TopicRectifier(own_times, [map_to_pinhole(each, camera) for each in own]), None, (doubt,)
+    return colour_rectifier, None, (doubt,)
 
 
 def _is_other_view(one: Camera, other: Camera) -> bool:
-    """Return whether two cameras see different parts of the world from one place."""
+    """Return whether two cameras have different fields of view: intrinsics relative to the image's size."""
 
     def shares_of(camera: Camera) -> Array:
         across, down = camera.width, camera.height
         return np.array([camera.fx / across, camera.fy / down, camera.cx / across, camera.cy / down])
 
-    return not np.allclose(shares_of(one), shares_of(other), rtol=0.0, atol=_SAME_VIEW)
+    return not np.allclose(shares_of(one), shares_of(other), rtol=0.0, atol=_MAX_VIEW_DIFFERENCE)
 
 
 def _truth(
     chosen: ChosenTopics, formats: Mapping[str, ImageFormat], index: BagIndex, stamps_ns: list[int]
 ) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"], str]:
-    """Return the true path, its kind, and a sentence about it."""
+    """Return the true path of the colour or left camera, its kind, and a sentence on its source.
+
+    The path is None without poses, or if the clock was set back.
+    """
     if index.colour.clock_step_ns:
         return None, "none", "no ground truth: the clock of its stamps was set back in the drive"
     frame = formats[chosen.colour.name].frame
@@ -688,7 +731,10 @@ def _imu(
     T_left_camera: Array,
     options: BagOptions,
 ) -> tuple[ImuTrack | None, tuple[str, ...]]:
-    """Return the samples of the IMU and what to say; one that cannot be used is refused if it is wanted."""
+    """Return the samples of the IMU, and notes for the user.
+
+    An IMU that cannot be used gives None and a note, or raises UsageError if the user demands or names it.
+    """
     if chosen.imu is None:
         if options.use_imu:
             raise UsageError("the bag has no IMU", hint="leave out --imu")
@@ -725,10 +771,10 @@ def _pair_note(rectification: Rectification | None) -> tuple[str, ...]:
     )
 
 
-def _losses(
+def _loss_facts(
     index: BagIndex, pairs: Sequence[_Pair], chosen: ChosenTopics, options: BagOptions
 ) -> Iterator[LossFacts]:
-    """Yield what was left out."""
+    """Yield the facts on messages and images that were left out, by cause."""
     images = [index.colour] if chosen.second is None else [index.colour, index.second]
     total = sum(len(each.stamps_ns) for each in images)
     if index.broken:
@@ -756,7 +802,7 @@ def _losses(
 
 
 def _order_notes(index: BagIndex) -> Iterator[str]:
-    """Yield what was put right, without a loss."""
+    """Yield notes on time stamps that were corrected, sorted or replaced."""
     if index.colour.clock_step_ns:
         yield (
             f"the clock of the time stamps was set back by {index.colour.clock_step_ns / 1e9:.3f} s in the "

@@ -1,6 +1,6 @@
-"""A ROS bag as a stream of raw messages: ROS 1 bag, ROS 2 sqlite3, ROS 2 MCAP, compressed or not.
+"""Read a ROS bag as a stream of raw messages: ROS 1 bag, ROS 2 sqlite3, ROS 2 MCAP, compressed or not.
 
-Every fault of a file becomes one named error.  It knows nothing of images, poses or cameras.
+Damaged files raise UsageError when they are opened, and BrokenMessage later.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from rse_pf.errors import MissingExtra, UsageError
 
 __all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "is_bag", "open_bag_file"]
 
-_ENDINGS = (".bag", ".db3", ".mcap")
+_ENDINGS = (".bag", ".db3", ".mcap")  # endings of bag files
 _FAULTS = (
     ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError,
     RuntimeError, TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What the readers raise, beside their own errors, where the bytes of a bag make no sense."""
+"""Exceptions that the readers raise for malformed bags, in addition to their own ones."""
 _REPAIR = "repair it: rosbag reindex (ROS 1), ros2 bag reindex, or mcap recover; or copy it again"
 
 
 class BrokenMessage(ValueError):
-    """A message whose bytes make no sense; the others of its bag may be good."""
+    """A message of a bag is malformed; other messages of the bag may be valid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Topic:
-    """A topic of a bag: its name, the type of its messages as ROS 2 names it, and how many there are."""
+    """A topic of a bag: name, type of its messages as ROS 2 names it (*kind*), and number of messages."""
 
     name: str
     kind: str
@@ -43,7 +43,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawMessage:
-    """The bytes of a message, and when it was written to the bag, nanoseconds."""
+    """An encoded message with its topic, its type (*kind*), and its time of writing to the bag (ns)."""
 
     topic: str
     kind: str
@@ -52,7 +52,7 @@ class RawMessage:
 
 
 def is_bag(path: Path) -> bool:
-    """Say whether a path is a ROS bag by its name, or a folder with one."""
+    """Return whether a path is a ROS bag by its ending or ``metadata.yaml``, or a folder of one bag file."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or _only_bag_of(path) is not None
     return path.suffix in _ENDINGS
@@ -88,7 +88,7 @@ def open_bag_file(path: Path) -> BagFile:
 
 
 class BagFile(AutoClose):
-    """An open bag; close it, or use it in ``with``."""
+    """An open bag, whose topics are in ``topics``; close it, or use it in ``with``."""
 
     def __init__(self, path: Path, reader: Any, store: Any, *, size_bytes: int, is_ros1: bool) -> None:
         self.path = path
@@ -106,14 +106,15 @@ class BagFile(AutoClose):
         )
 
     def messages(self, names: Collection[str], start_ns: int | None = None) -> Iterator[RawMessage]:
-        """Return the messages of some topics in the order of the bag, from a time of the bag on.
+        """Yield the messages of the topics *names* in the order of the bag.
 
-        Only one of these iterators may be in use at a time.
+        *start_ns* is the time of writing, nanoseconds, of the first message; None begins at the start.  Only
+        one of these iterators may be in use at a time.
 
         Raises:
-            BrokenMessage: The bag cannot be read further.
+            BrokenMessage: The bag is damaged, and cannot be read further.
         """
-        wanted = [link for link in self._reader.connections if link.topic in names]
+        wanted = [connection for connection in self._reader.connections if connection.topic in names]
         if not wanted:
             return
         allowance = Allowance(self._size_bytes)
@@ -133,7 +134,7 @@ class BagFile(AutoClose):
         """Return the time stamp in the header of a message that begins with one, nanoseconds.
 
         Raises:
-            BrokenMessage: The message is too short.
+            BrokenMessage: The message is too short for a header.
         """
         try:
             if self._is_ros1:
@@ -146,15 +147,15 @@ class BagFile(AutoClose):
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def parse(self, raw: RawMessage) -> Any:
-        """Return a message with its fields; those of arrays are views of the bytes.
+        """Decode a message; its arrays are views of the bytes.
 
         Raises:
-            BrokenMessage: The bytes are not such a message.
+            BrokenMessage: The bytes are not a message of the stated type.
         """
         try:
             if self._is_ros1:
                 return self._store.deserialize_ros1(raw.data, raw.kind)
-            # A view: the library would copy the bytes behind their head.
+            # Pass a view: of bytes, the library would copy all that follow the four bytes of the head.
             return self._store.deserialize_cdr(memoryview(raw.data), raw.kind)
         except _all_faults() as error:
             raise BrokenMessage(_said(error)) from error

@@ -1,6 +1,6 @@
-"""Choose the topics of a bag that a map is made of, by their types and names.
+"""Choose the topics of a bag from which a map is made, by their types and names.
 
-Pure decisions over what is known of the topics; a topic that the user names always wins.
+The functions are pure, and read no messages.  A topic that the user names is preferred to all others.
 """
 
 from __future__ import annotations
@@ -26,19 +26,28 @@ from rse_pf.errors import UsageError
 
 __all__ = ["ChosenTopics", "choose_topics", "is_rectified", "is_registered", "topics_line"]
 
-_IMAGES = {IMAGE, COMPRESSED_IMAGE}
-_POSES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
-_TF = {TF, TF_OF_ROS1}
-_MOST_LISTED = 12
+_IMAGES = {IMAGE, COMPRESSED_IMAGE}  # message types of images
+_POSES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)  # message types of poses
+_TF = {TF, TF_OF_ROS1}  # message types of transforms
+_MAX_LISTED = 12  # largest number of topics that an error message lists
 _SIDES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("image_0", "image_1"))
-"""What drivers and data sets call the two cameras of a pair."""
+"""Parts of topic names with which drivers and data sets distinguish the left and the right camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChosenTopics:
-    """The topics that a map is made of; None where there is none, and tf as the names of its topics.
+    """The topics from which a map is made; None for a sensor that is missing or not used.
 
-    Of a stereo pair, *colour* is the left camera.
+    Attributes:
+        colour: Images of the colour camera, or of the left camera of a stereo pair.
+        depth: Depth images.
+        right: Images of the right camera of a stereo pair.
+        colour_info: ``CameraInfo`` of *colour*.
+        depth_info: ``CameraInfo`` of *depth*.
+        right_info: ``CameraInfo`` of *right*.
+        poses: Ground truth or reference poses.
+        imu: Samples of the IMU.
+        tf: Names of all topics of transforms.
     """
 
     colour: Topic
@@ -53,14 +62,14 @@ class ChosenTopics:
 
     @property
     def infos(self) -> tuple[str, ...]:
-        """The topics of the cameras that are used."""
+        """The names of the ``CameraInfo`` topics that are used."""
         return tuple(
             info.name for info in (self.colour_info, self.depth_info, self.right_info) if info is not None
         )
 
     @property
     def second(self) -> Topic | None:
-        """What belongs to each image of *colour*: depth, or the right image."""
+        """The topic of the images that are paired with those of *colour*: depth, or else the right camera."""
         return self.right if self.depth is None else self.depth
 
 
@@ -79,21 +88,27 @@ def choose_topics(
     use_stereo: bool | None = None,
     use_imu: bool = True,
 ) -> ChosenTopics:
-    """Return the topics of a map.
+    """Choose the topics from which a map is made.
 
-    A stereo pair is taken by itself where there is no depth, and where names tell of exactly one pair.
+    Without depth, a stereo pair is used if the names of the topics show exactly one pair.
 
     Args:
         topics: All topics of the bag.
-        formats: Name of an image topic to what its first message is.
-        info_frames: Name of a ``CameraInfo`` topic to its frame.
-        colour: The user's choice, and so are *depth*, *right*, *poses*, *imu*, and *info* (of the colours).
-        use_depth: False leaves the depth out, and takes one camera unless *right* is named.
-        use_stereo: True takes the pair instead of depth; False takes the left camera of a pair alone.
-        use_imu: False leaves the IMU out.
+        formats: Format of the first message of each image topic, by name of the topic.
+        info_frames: Frame of each ``CameraInfo`` topic, by name of the topic.
+        colour: Topic of the colour or left images that the user named; None chooses one, also below.
+        depth: Topic of the depth images that the user named.
+        right: Topic of the right images that the user named.
+        info: Topic of the ``CameraInfo`` of *colour* that the user named.
+        poses: Topic of the poses that the user named.
+        imu: Topic of the IMU that the user named.
+        use_depth: False uses neither depth nor a stereo pair, unless *right* is named.
+        use_stereo: True uses a stereo pair even if there is depth; False uses only the left camera of a pair;
+            None uses a pair if there is no depth.
+        use_imu: Whether to use an IMU.
 
     Raises:
-        UsageError: A topic is missing; the message lists those that were found.
+        UsageError: A topic is missing, or named topics do not fit; the message lists the topics of the bag.
     """
     images = [topic for topic in topics if topic.kind in _IMAGES and topic.messages]
     has_depth = any(formats[each.name].holds == "depth" for each in images if each.name in formats)
@@ -110,7 +125,7 @@ def choose_topics(
     if pair is None:
         of_colour, of_right = _choose(topics, images, formats, "colour", colour, None), None
         if colour is None:  # of a pair, the left one
-            lefts = {other.name: one for one, other in _pairs(images, formats)}
+            lefts = {other.name: one for one, other in _side_pairs(images, formats)}
             of_colour = lefts.get(of_colour.name, of_colour)
     else:
         of_colour, of_right = pair[0], None if use_stereo is False else pair[1]
@@ -128,7 +143,7 @@ def choose_topics(
         depth=of_depth,
         right=of_right,
         colour_info=colour_info,
-        # Both cameras of a pair may bear one frame, which must not lend the right one the lens of the left.
+        # If both cameras have one frame, the search by frame finds the left camera's topic for the right one.
         right_info=None if right_info == colour_info else right_info,
         depth_info=None if of_depth is None else _info_of(of_depth, infos, formats, info_frames),
         poses=_poses(topics, poses),
@@ -138,24 +153,24 @@ def choose_topics(
 
 
 def is_rectified(topic: Topic) -> bool:
-    """Say whether the images of a topic have no distortion any more, by the names that ROS gives them."""
+    """Return whether the images of a topic are rectified, by the naming of ROS (``image_rect``)."""
     return "rect" in _base(topic).rpartition("/")[2].split("_")
 
 
 def is_registered(topic: Topic) -> bool:
-    """Say whether depth is in the pixels of the colours, by the names that drivers give it."""
+    """Return whether the depth of a topic is registered to the colour image, by the naming of drivers."""
     return "aligned" in topic.name or "registered" in topic.name
 
 
 def topics_line(topics: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> str:
-    """Return the topics of a bag with their types, for one line of an error."""
+    """Return the topics of a bag with their types and encodings as one line, at most 12 of them."""
     words = []
     for topic in topics:
         kind = topic.kind.replace("/msg/", "/").rpartition("/")[2]
         encoding = f" {formats[topic.name].encoding}" if topic.name in formats else ""
         words.append(f"{topic.name} ({kind}{encoding})")
-    more = len(words) - _MOST_LISTED
-    listed = ", ".join(words[:_MOST_LISTED]) or "none"
+    more = len(words) - _MAX_LISTED
+    listed = ", ".join(words[:_MAX_LISTED]) or "none"
     return f"{listed} and {more} more" if more > 0 else listed
 
 
@@ -165,7 +180,7 @@ def _choose(
     formats: Mapping[str, ImageFormat],
     wanted: str,
     named: str | None,
-    beside: ImageFormat | None,
+    colour_format: ImageFormat | None,
 ) -> Topic:
     if named is not None:
         topic = _find_named(topics, named, _IMAGES)
@@ -185,7 +200,7 @@ def _choose(
             hint = f"use the colours alone with --no-depth, or two cameras with --right TOPIC, or {hint}"
         raise UsageError(f"the bag has no {wanted}; its topics: {topics_line(topics, formats)}", hint=hint)
     most = max(topic.messages for topic in good)
-    return max(good, key=lambda each: _merit(each, formats[each.name], wanted, beside, most))
+    return max(good, key=lambda each: _preference(each, formats[each.name], wanted, colour_format, most))
 
 
 def _choose_pair(
@@ -195,8 +210,11 @@ def _choose_pair(
     left: str | None,
     right: str | None,
 ) -> tuple[Topic, Topic] | None:
-    """Return the left and the right topic of the one pair that there is, or that the user names."""
-    pairs = _pairs(images, formats)
+    """Return the left and right topic of the pair that the user names, or else of the only pair by names.
+
+    None if there is no such pair, or several.
+    """
+    pairs = _side_pairs(images, formats)
     if right is not None:
         of_right = _choose(topics, images, formats, "colour", right, None)
         if left is None:
@@ -214,11 +232,11 @@ def _choose_pair(
     if len({_base(one).rpartition("/")[0] for one, _ in pairs}) != 1:
         return None
     most = max(one.messages for one, _ in pairs)
-    return max(pairs, key=lambda pair: _merit(pair[0], formats[pair[0].name], "colour", None, most))
+    return max(pairs, key=lambda pair: _preference(pair[0], formats[pair[0].name], "colour", None, most))
 
 
-def _pairs(images: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> list[tuple[Topic, Topic]]:
-    """Return all left and right topics of one kind whose names differ by the side alone."""
+def _side_pairs(images: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> list[tuple[Topic, Topic]]:
+    """Return all pairs of a left and a right topic of one type whose names differ only in one of `_SIDES`."""
     good = {
         (each.name, each.kind): each
         for each in images
@@ -236,10 +254,14 @@ def _pairs(images: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> list[
     return pairs
 
 
-def _merit(
-    topic: Topic, image: ImageFormat, wanted: str, beside: ImageFormat | None, most: int
+def _preference(
+    topic: Topic, image: ImageFormat, wanted: str, colour_format: ImageFormat | None, most: int
 ) -> tuple[object, ...]:
-    """Return what makes a topic the better choice, the weightiest first."""
+    """Return a sort key of an image topic; the topic with the largest key is chosen.
+
+    *wanted* is ``colour`` or ``depth``, *colour_format* the format of the colour images for depth, and *most*
+    the number of messages of the largest candidate.
+    """
     name = topic.name.lower()
     is_raw = topic.kind == IMAGE
     enough = 2 * topic.messages >= most
@@ -248,12 +270,12 @@ def _merit(
         is_other = any(word in name for word in ("infra", "/ir/", "depth", "confidence", "fisheye"))
         is_grey = image.encoding in ("mono8", "8UC1")
         return enough, not is_other, is_colour, not is_grey, is_raw, topic.messages, _short_first(topic.name)
-    same_frame = beside is not None and image.frame == beside.frame
+    same_frame = colour_format is not None and image.frame == colour_format.frame
     return enough, is_registered(topic), same_frame, is_raw, topic.messages, _short_first(topic.name)
 
 
 def _short_first(name: str) -> tuple[int, ...]:
-    """Return a key that prefers short names, and the first of the alphabet."""
+    """Return a sort key that is largest for the shortest name, and among these for the first by alphabet."""
     return (-len(name), *(-ord(letter) for letter in name))
 
 
@@ -290,9 +312,12 @@ def _base_of(name: str) -> str:
 def _info_of(
     topic: Topic, infos: Sequence[Topic], formats: Mapping[str, ImageFormat], frames: Mapping[str, str]
 ) -> Topic | None:
-    """Return the camera of an image topic: its neighbour by name, that of its namespace, or of its frame.
+    """Return the ``CameraInfo`` topic of an image topic; None if there is none, or no unique one.
 
-    A RealSense recorder writes ``Color_0/image/data`` beside ``Color_0/info/camera_info``, all of one frame.
+    That is the topic with the name that ROS prescribes, else the one that shares more of its name with this
+    image topic than with others, else the only one with the same frame.
+
+    A RealSense recorder writes ``Color_0/image/data`` and ``Color_0/info/camera_info``, all with one frame.
     """
     base = _base(topic)
     wanted = (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info")
@@ -311,7 +336,7 @@ def _info_of(
 
 
 def _shared(name: str, other: str) -> int:
-    """Return how many of the first parts of two topics are equal."""
+    """Return the number of leading parts (between slashes) that the names of two topics have in common."""
     parts = zip(name.strip("/").split("/"), other.strip("/").split("/"), strict=False)
     return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], parts))
 
@@ -324,7 +349,10 @@ def _poses(topics: Sequence[Topic], named: str | None) -> Topic | None:
 
 
 def _imu(topics: Sequence[Topic], named: str | None) -> Topic | None:
-    """Return the IMU with most messages; topics that drivers name after one half of it do not count."""
+    """Return the named IMU topic, else the one with most messages; None without one.
+
+    Topics with ``gyro`` or ``accel`` in their name hold one of the two sensors only, and are not chosen.
+    """
     if named is not None:
         return _find_named(topics, named, {IMU})
     whole = [

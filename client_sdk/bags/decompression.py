@@ -1,6 +1,6 @@
-"""Decompress what a bag holds within bounds of memory and work; `rosbags` has none of its own.
+"""Decompress bags within bounds of memory and work, which the library `rosbags` does not have.
 
-`bound_reader` puts the functions of this module in the place of its own.  Nothing here knows messages.
+`bound_reader` replaces the decompression functions of `rosbags` by those of this module.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Any
 __all__ = ["MAX_CHUNK_BYTES", "Allowance", "bound_reader", "charge"]
 
 MAX_CHUNK_BYTES = 256 << 20
-"""Of one chunk or message; writers end a chunk at some MB and one message."""
-_FREE_BYTES, _RATIO = 4 << 30, 200
-"""What one pass over a bag may decompress: so much, and so many times its size."""
+"""Largest decompressed size of a chunk or message; writers close a chunk after some MB and one message."""
+_FREE_BYTES = 4 << 30  # bytes that one pass over a bag may decompress, whatever the size of the bag
+_RATIO = 200  # bytes that one pass may decompress in addition for each byte of the bag
 
 
 class Allowance:
-    """How many bytes one pass over a bag of *size_bytes* may still decompress."""
+    """The number of bytes that one pass over a bag of *size_bytes* may still decompress, ``left_bytes``."""
 
     def __init__(self, size_bytes: int) -> None:
         self.left_bytes = _FREE_BYTES + _RATIO * size_bytes
 
     def take(self, size_bytes: int) -> None:
-        """Count what was decompressed; raises ValueError above the bound."""
+        """Subtract decompressed bytes; raises ValueError if none are left."""
         self.left_bytes -= size_bytes
         if self.left_bytes < 0:
             raise ValueError("it decompresses to far more than it has bytes")
@@ -38,14 +38,14 @@ _charged = Allowance(0)
 
 
 def charge(allowance: Allowance) -> None:
-    """Count what is decompressed from now on for *allowance*."""
+    """Subtract all bytes that are decompressed from now on in this process from *allowance*."""
     global _charged
     _charged = allowance
 
 
 @functools.cache
 def bound_reader() -> None:
-    """Let `rosbags` decompress with the functions of this module."""
+    """Replace the decompression functions of `rosbags` in this process by those of this module."""
     names = ("rosbag1.reader", "rosbag2.storage_mcap", "rosbag2.reader")
     modules: list[Any] = [importlib.import_module(f"rosbags.{name}") for name in names]
     ros1, mcap, ros2 = modules
@@ -67,7 +67,11 @@ def bound_reader() -> None:
 
 
 def _decompress(make: Callable[[], Any], data: bytes, size: int | None = None) -> bytes:
-    """Return the content of all streams in *data*; raises ValueError above *size* or the bound."""
+    """Decompress all streams in *data* with decompressors that *make* returns.
+
+    Raises ValueError if the result is larger than *size* or 256 MiB, if the allowance is used up, or if the
+    data are truncated.
+    """
     parts: list[bytes] = []
     max_bytes = left = MAX_CHUNK_BYTES if size is None else min(size, MAX_CHUNK_BYTES)
     while data:
@@ -85,13 +89,13 @@ def _decompress(make: Callable[[], Any], data: bytes, size: int | None = None) -
 
 
 class _CountedFile(io.RawIOBase):
-    """A compressed file whose content is counted while it is read."""
+    """A compressed file whose decompressed bytes are subtracted from the allowance while it is read."""
 
     def __init__(self, opened: Callable[..., Any], file: Any, mode: str) -> None:
         self._content = opened(file, mode)
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next bytes; raises ValueError above the bound."""
+        """Return the next decompressed bytes; raises ValueError if the allowance is used up."""
         data: bytes = self._content.read(size)
         _charged.take(len(data))
         return data

@@ -1,6 +1,6 @@
-"""Images of ROS messages as arrays: colours of 8 bits, depth in metres.
+"""Decode the images of ROS messages: RGB with 8 bits, and depth in metres.
 
-Pure functions over message fields; they read no file.
+The functions are pure, and read no files.
 """
 
 from __future__ import annotations
@@ -29,18 +29,28 @@ _COLOUR = {
     "yuv422": (2, "YUV2RGB_UYVY"), "uyvy": (2, "YUV2RGB_UYVY"),
     "yuv422_yuy2": (2, "YUV2RGB_YUY2"), "yuyv": (2, "YUV2RGB_YUY2"),
 }  # fmt: skip
-"""Bytes of a pixel, and OpenCV's conversion."""
-_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+"""Encodings of colour images: bytes of a pixel, and OpenCV's conversion to RGB (None for RGB)."""
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}  # encodings of depth images, and their numpy types
 
-_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"  # first bytes of a JPEG image
+_PNG = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG image
+# Head of an image of compressed_depth_image_transport: its format, and the parameters a and b of the
+# quantisation of floats.
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 _NO_READING = 65535
-"""Some recorders write this for "no reading" in 16 bits."""
+"""Value with which some recorders mark a pixel without a reading in a 16-bit depth image; it is read as 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageFormat:
-    """What the images of a topic are: ``holds`` is empty where they are neither colours nor depth."""
+    """The format of the images of a topic.
+
+    Attributes:
+        holds: ``colour`` or ``depth``; empty for images that cannot be decoded.
+        encoding: Encoding of a raw image, or format of a compressed one, as the message states it.
+        frame: Name of the camera's frame.
+        size: Width and height, px; None if a compressed image does not state them.
+    """
 
     holds: Literal["colour", "depth", ""]
     encoding: str
@@ -49,7 +59,7 @@ class ImageFormat:
 
 
 def format_of(message: Any, kind: str) -> ImageFormat:
-    """Return what an image of a topic is, by its first message."""
+    """Return the format of an image message of the type *kind*, without decoding the image."""
     holds: Literal["colour", "depth", ""] = ""
     if kind != COMPRESSED_IMAGE:
         encoding = str(message.encoding)
@@ -68,7 +78,7 @@ def format_of(message: Any, kind: str) -> ImageFormat:
     elif data.startswith(_JPEG):
         holds = "colour"
     elif data.startswith(_PNG):
-        # IHDR holds width, height, bits of a channel and the kind of colour: 16 bits of grey are depth.
+        # Bytes 24 and 25 of a PNG are bits per channel and colour type: grey of 16 bits is depth.
         holds = "depth" if data[24:26] == b"\x10\x00" else "colour"
     return ImageFormat(
         holds=holds, encoding=encoding or "no format", frame=message.header.frame_id, size=_coded_size(data)
@@ -76,10 +86,10 @@ def format_of(message: Any, kind: str) -> ImageFormat:
 
 
 def check_image(message: Any, expected: ImageFormat) -> None:
-    """Refuse an image that cannot be decoded, or is not like the first of its topic, without decoding it.
+    """Check an image message without decoding it, against the format of the first one of its topic.
 
     Raises:
-        BrokenMessage: It is cut off, damaged, or of another size or encoding.
+        BrokenMessage: The image is truncated or damaged, or has another size or encoding.
     """
     if hasattr(message, "encoding"):
         if (message.width, message.height) != expected.size or message.encoding != expected.encoding:
@@ -104,7 +114,7 @@ def check_image(message: Any, expected: ImageFormat) -> None:
 
 
 def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
-    """Return the ``(h, w, 3)`` colours of a message, red first.
+    """Return the RGB image ``(h, w, 3)`` of a message.
 
     Raises:
         BrokenMessage: The image cannot be decoded.
@@ -128,9 +138,9 @@ def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
 
 
 def decode_depth(message: Any, depth_scale: float) -> npt.NDArray[np.float32]:
-    """Return the ``(h, w)`` depth in metres, 0 where there is no reading.
+    """Return the depth image ``(h, w)`` of a message, metres, 0 for pixels without a reading.
 
-    Values of 16 bits are divided by *depth_scale*; those of 32 bits are metres.
+    16-bit values are divided by *depth_scale* (units per metre); 32-bit floats are metres.
 
     Raises:
         BrokenMessage: The image cannot be decoded.
@@ -154,7 +164,7 @@ def decode_depth(message: Any, depth_scale: float) -> npt.NDArray[np.float32]:
         raise BrokenMessage("a depth image does not hold 16 bits of one channel")
     if not is_quantised:
         return _metres_of_units(image, depth_scale)
-    # compressed_depth_image_transport stores a / depth + b; 0 is "no reading".
+    # compressed_depth_image_transport stores a / depth + b, and 0 for a pixel without a reading.
     inverse = image.astype(np.float32) - np.float32(b)
     with np.errstate(divide="ignore", invalid="ignore"):
         return _metres_of_floats(np.where(image > 0, np.float32(a) / inverse, np.float32(0)))
@@ -171,7 +181,7 @@ def _decode(cv2: Any, data: npt.NDArray[np.uint8], flags: int) -> npt.NDArray[An
 
 
 def _rows(message: Any) -> npt.NDArray[np.uint8]:
-    """Return the ``(h, bytes)`` rows of a raw image without their padding."""
+    """Return the rows ``(h, bytes)`` of a raw image without padding; raises BrokenMessage if too short."""
     encoding = message.encoding
     bytes_per_px = _COLOUR[encoding][0] if encoding in _COLOUR else np.dtype(_DEPTH[encoding]).itemsize
     used, height, step = message.width * bytes_per_px, message.height, message.step
@@ -196,7 +206,7 @@ def _metres_of_floats(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
 
 
 def _coded_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height that a JPEG or PNG states, px; None if it states none that can be used."""
+    """Return width and height, px, that a JPEG or PNG image states; None if the head is invalid."""
     try:
         return photo_size(data)
     except RsePfError:
@@ -204,7 +214,10 @@ def _coded_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _check_png(data: bytes) -> None:
-    """Check the sums of all chunks: they cost a tenth of decoding the image."""
+    """Verify the checksums of all chunks of a PNG image, which takes a tenth of the time of decoding it.
+
+    Raises BrokenMessage if the image is damaged or truncated.
+    """
     place = len(_PNG)
     while place + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, place)

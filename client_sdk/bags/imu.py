@@ -1,7 +1,4 @@
-"""The IMU of a bag: ``sensor_msgs/Imu`` as samples on the clock of its stamps.
-
-Readings are kept as numbers, at most `_MAX_SAMPLES` of them.
-"""
+"""Read the samples of an IMU from the ``sensor_msgs/Imu`` messages of a bag, at most `_MAX_SAMPLES`."""
 
 from __future__ import annotations
 
@@ -22,15 +19,20 @@ from rse_pf.geometry import Array
 __all__ = ["ImuMount", "ImuReadings", "imu_track", "numbers_of_imu"]
 
 _MAX_SAMPLES = 2_000_000
-"""Two hours and a half at 200 Hz, 128 MB."""
+"""Largest number of samples that are kept, 128 MB: almost three hours at 200 Hz."""
 _USUAL_NOISE = {"gyro_noise": 1e-3, "gyro_walk": 1e-4, "accel_noise": 6e-3, "accel_walk": 3e-3}
-"""Of a small MEMS IMU as in depth cameras: four times the densities in the data sheet of Bosch's BMI055
-(0.014 degree/s/sqrt(Hz), 150 ug/sqrt(Hz)), because a robot shakes; walks as EuRoC's, or five times that."""
+"""Noise that is assumed for an IMU whose noise is not stated, a small MEMS IMU as in depth cameras: four
+times the noise densities in the data sheet of Bosch's BMI055 (0.014 degree/s/sqrt(Hz), 150 ug/sqrt(Hz)),
+because a robot shakes.  The random walk of the accelerations is that of EuRoC's IMU, that of the rates five
+times it. Units are those of `RigImu`."""
 _HINT = "leave the IMU out with --no-imu, or give its place and noise with --intrinsics rig.json"
 
 
 class ImuReadings:
-    """What the messages of a topic hold; ``frame`` is that of the first one."""
+    """The samples of an IMU topic.
+
+    ``frame`` is the frame of the first message; ``ignored`` counts samples beyond the largest number.
+    """
 
     def __init__(self) -> None:
         self.frame = ""
@@ -43,10 +45,10 @@ class ImuReadings:
         return len(self._stamps_ns)
 
     def add(self, message: Any, stamp_ns: int, log_ns: int) -> None:
-        """Add a message.
+        """Add the sample of a message with its stamp and time of writing, nanoseconds.
 
         Raises:
-            BrokenMessage: It lacks rates or accelerations, or a number is not finite.
+            BrokenMessage: The message lacks rates or accelerations, or a number is not finite.
         """
         numbers = numbers_of_imu(message)
         if len(self) >= _MAX_SAMPLES:
@@ -59,7 +61,11 @@ class ImuReadings:
         self._values.extend(numbers)
 
     def sorted(self, *, use_log_time: bool) -> tuple[Array, Array]:
-        """Return ``(n,)`` ascending seconds, each once, and ``(n, 6)`` rates and accelerations."""
+        """Return ascending times ``(n,)``, s, and rates (rad/s) and accelerations (m/s^2) ``(n, 6)``.
+
+        Of several samples with one time, the first is returned.  With *use_log_time*, the times are those of
+        writing, else the stamps.
+        """
         stamps_ns = np.frombuffer(self._log_ns if use_log_time else self._stamps_ns, dtype=np.int64)
         unique, rows = np.unique(stamps_ns, return_index=True)
         return unique / 1e9, np.frombuffer(self._values).reshape(-1, 6)[rows]
@@ -69,7 +75,7 @@ def numbers_of_imu(message: Any) -> tuple[float, ...]:
     """Return the three rates and three accelerations of a ``sensor_msgs/Imu``, rad/s and m/s^2.
 
     Raises:
-        BrokenMessage: It lacks some of them, or a number is not finite.
+        BrokenMessage: The message states that it lacks some of them, or a number is not finite.
     """
     if message.angular_velocity_covariance[0] == -1 or message.linear_acceleration_covariance[0] == -1:
         raise BrokenMessage("a message of an IMU has no rates, or no accelerations")
@@ -82,12 +88,15 @@ def numbers_of_imu(message: Any) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImuMount:
-    """Where the IMU and the camera of the frames sit.
+    """The poses of the IMU and of the camera of the frames.
 
     Attributes:
-        T_left_camera: ``(4, 4)``, pose of the camera of the frames in the (left) camera of the bag.
-        T_left_imu: ``(4, 4)``, pose of the IMU in that; None if tf does not tell.
-        rig: Of the user; what it says of the IMU is taken before tf and the usual noise.
+        T_left_camera: ``(4, 4)``, metres, pose of the camera of the frames, which may be rectified, in the
+            colour or left camera of the bag.
+        T_left_imu: ``(4, 4)``, metres, pose of the IMU in the colour or left camera; None if tf does not
+            connect them.
+        rig: The rig that the user gave, or None; its pose and noise of the IMU are used instead of tf and the
+            assumed noise.
     """
 
     T_left_camera: Array
@@ -98,17 +107,18 @@ class ImuMount:
 def imu_track(
     readings: ImuReadings, topic: str, frames_s: Array, mount: ImuMount, *, use_log_time: bool
 ) -> tuple[ImuTrack, str]:
-    """Return the samples for frames of a camera, and a sentence about them.
+    """Return the samples of the IMU with its model, and a sentence about them for the user.
 
     Args:
-        readings: Of the topic.
-        topic: Its name.
-        frames_s: ``(n,)``, times of the frames, ascending.
-        mount: Of the IMU.
-        use_log_time: Take the times of writing.
+        readings: The samples of the topic.
+        topic: Name of the topic, for messages.
+        frames_s: ``(n,)``, ascending times of the frames, s.
+        mount: Poses of the IMU and of the camera.
+        use_log_time: Whether times of writing are used instead of time stamps.
 
     Raises:
-        UsageError: The IMU cannot be used.
+        UsageError: There are too few samples, none between the frames, too many between two frames, or the
+            pose of the IMU is not known.
     """
     rig = mount.rig
     stamps_s, values = readings.sorted(use_log_time=use_log_time)
@@ -133,7 +143,7 @@ def imu_track(
 
 
 def _noise(topic: str, stamps_s: Array, T_left_imu: Array | None, rig: Rig | None) -> tuple[RigImu, str]:
-    """Return place and noise of the IMU, and whose they are."""
+    """Return pose and noise of the IMU, and a phrase on their source; raises UsageError without a pose."""
     if rig is not None and rig.imu is not None:
         return rig.imu, "as the file of intrinsics states it"
     if T_left_imu is None:

@@ -1,7 +1,7 @@
-"""What a bag holds, found by reading it once: time stamps, broken images, transforms and poses.
+"""Read a bag once, and collect time stamps, transforms, poses, IMU samples and the number of broken messages.
 
-Images are checked but not decoded, and none is kept: memory grows by 16 bytes for an image, and by 64 for a
-sample of an IMU.
+Images are checked, but neither decoded nor kept: the memory grows by 16 bytes for an image, and by 64 for a
+sample of the IMU.
 """
 
 from __future__ import annotations
@@ -28,15 +28,22 @@ Stamps = npt.NDArray[np.int64]
 
 
 _MAX_STEP_MISMATCH = 0.5
-"""Of a step: the latency of the messages after it may differ from the step by so much of it."""
+"""Largest difference between a step back of the time stamps and the change of the latency there, as a share
+of the step, for a clock that was set back."""
 
 
 @dataclass(slots=True)
 class ImageStamps:
-    """Of the good images of a topic: ``stamps_ns`` ascending, as in the messages, and when each was written.
+    """The times of the valid images of a topic, nanoseconds, sorted by time stamp.
 
-    ``stamps_ns`` go on where the clock was set back by ``clock_step_ns`` in the drive; ``header_ns`` are
-    those of the messages.  ``unstamped`` messages had the stamp 0 among others that have one.
+    Attributes:
+        stamps_ns: ``(n,)``, ascending time stamps, continued where the clock was set back.
+        header_ns: ``(n,)``, time stamps in the messages.
+        log_ns: ``(n,)``, times of writing to the bag.
+        was_in_order: Whether the stamps ascended in the order of the bag.
+        copies: Number of images that were left out because another one has the same stamp.
+        unstamped: Number of images that were left out because their stamp is 0.
+        clock_step_ns: Time by which the clock was set back in all; 0 if it was not.
     """
 
     stamps_ns: Stamps
@@ -50,9 +57,19 @@ class ImageStamps:
 
 @dataclass(slots=True, eq=False)
 class BagIndex:
-    """What one pass over a bag found; ``broken`` messages were left out, ``ended`` says why it stopped.
+    """The result of reading a bag once.
 
-    ``second`` are the images of depth or of the right camera; those of the colours where there is neither.
+    Attributes:
+        colour: Times of the colour or left images.
+        second: Times of the depth or right images; the same as *colour* without such images.
+        tree: The frames of tf.
+        poses: The poses of the chosen topic.
+        imu: The samples of the IMU.
+        broken: Number of malformed messages, which were left out.
+        first_broken: Topic and error of the first of them.
+        ended: Why the bag could not be read to its end; "" if it was.
+        uses_log_time: Whether times of writing replace the stamps, since all stamps of a topic are 0.
+        cameras: The ``CameraInfo`` messages by name of the topic.
     """
 
     colour: ImageStamps
@@ -69,7 +86,7 @@ class BagIndex:
 
 @dataclass(slots=True)
 class CameraTimes:
-    """The ``CameraInfo`` messages of a topic that differ, and which of them was valid when."""
+    """The different ``CameraInfo`` messages of a topic, in ``messages``, and when each of them is valid."""
 
     messages: list[Any] = field(default_factory=list)
     _rows: dict[int, int] = field(default_factory=dict)
@@ -77,7 +94,7 @@ class CameraTimes:
     _logged: list[int] = field(default_factory=list)
 
     def add(self, message: Any, stamp_ns: int, log_ns: int) -> None:
-        """Add a message, which may be equal to one before."""
+        """Add a message with its stamp and time of writing, ns; equal messages are kept once."""
         numbers = _numbers_of_camera(message)
         known = [_numbers_of_camera(each) for each in self.messages]
         row = known.index(numbers) if numbers in known else len(known)
@@ -88,7 +105,10 @@ class CameraTimes:
         self._logged.append(row)
 
     def row_at(self, stamp_ns: int, log_ns: int) -> int:
-        """Return the row of the message of an image: that of its stamp, or the last one before it."""
+        """Return the index in ``messages`` that is valid for an image.
+
+        That is the message with the stamp of the image, else the last one that was written before it.
+        """
         if len(self.messages) < 2:
             return 0
         if stamp_ns in self._rows:
@@ -106,7 +126,7 @@ def _numbers_of_camera(message: Any) -> tuple[Any, ...]:
 
 
 @dataclass(slots=True)
-class _Collected:
+class _ImageTimes:
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     log_ns: array[int] = field(default_factory=lambda: array("q"))
 
@@ -115,7 +135,7 @@ class _Collected:
         header_ns = log_ns if use_log_time else np.array(self.stamps_ns, dtype=np.int64)
         is_stamped = header_ns != 0
         header_ns, log_ns = header_ns[is_stamped], log_ns[is_stamped]
-        stamps_ns, clock_step_ns = _continued(header_ns, log_ns)
+        stamps_ns, clock_step_ns = _continue_stamps(header_ns, log_ns)
         unique, rows = np.unique(stamps_ns, return_index=True)
         return ImageStamps(
             stamps_ns=unique,
@@ -128,11 +148,12 @@ class _Collected:
         )
 
 
-def _continued(header_ns: Stamps, log_ns: Stamps) -> tuple[Stamps, int]:
-    """Return stamps that go on where the clock was set back, and by how much it was in all.
+def _continue_stamps(header_ns: Stamps, log_ns: Stamps) -> tuple[Stamps, int]:
+    """Continue the time stamps where the clock was set back; return them, and the sum of the steps, ns.
 
-    A clock that is set back makes all later messages look late by the step.  Messages that were only written
-    in another order keep their latency, and so keep their stamps.
+    If the clock is set back, the latency from stamp to writing grows by the step in all later messages.  If
+    it does not, the messages were only written in another order; then the stamps stay as they are, and the
+    sum is 0.
     """
     latency_ns = log_ns - header_ns
     steps = np.flatnonzero(np.diff(header_ns) < 0) + 1
@@ -145,10 +166,10 @@ def _continued(header_ns: Stamps, log_ns: Stamps) -> tuple[Stamps, int]:
 
 
 def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageFormat]) -> BagIndex:
-    """Read the bag once, and return what it holds of the chosen topics."""
-    images = {chosen.colour.name: _Collected()}
+    """Read the chosen topics of a bag once; *formats* are the formats of the image topics by name."""
+    images = {chosen.colour.name: _ImageTimes()}
     if chosen.second is not None:
-        images[chosen.second.name] = _Collected()
+        images[chosen.second.name] = _ImageTimes()
     tree, poses, broken, first_broken, ended = TransformTree(), PoseTopic(), 0, "", ""
     pose_topic = None if chosen.poses is None else chosen.poses.name
     imu, imu_topic = ImuReadings(), None if chosen.imu is None else chosen.imu.name
@@ -180,7 +201,7 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
         except BrokenMessage as error:
             broken += 1
             first_broken = first_broken or f"{raw.topic}: {error}"
-    # Some drivers leave the stamps at 0; then the time of writing is all that both have.
+    # Some drivers leave all stamps at 0; then the times of writing are used for both topics of images.
     no_stamps = any(not any(image.stamps_ns) for image in images.values())
     stamps = [image.finish(use_log_time=no_stamps) for image in images.values()]
     return BagIndex(

@@ -1,4 +1,4 @@
-"""The camera of a ROS ``CameraInfo`` message, and its images without the distortion of its lens."""
+"""Read the lens of a camera from a ROS ``CameraInfo`` message, or from a file of intrinsics."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ _HINT = "give the intrinsics yourself: --intrinsics intrinsics.json"
 
 
 def lens_or_rig(file: Path) -> tuple[Lens | None, Rig | None]:
-    """Return what a file of intrinsics, or of a rig, holds: ``lens`` and ``rig`` of `BagOptions`.
+    """Read a file of intrinsics or of a rig; return (lens, None) or (None, rig) for `BagOptions`.
 
     Raises:
-        UsageError: The file is neither.
+        UsageError: The file is neither, or cannot be read.
     """
     own = read_calibration(file)
     return (own, None) if isinstance(own, Intrinsics) else (None, own)
 
 
 def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
-    """Return the lens of a ``CameraInfo``; that of rectified images has the matrix P and no distortion.
+    """Return the lens of a ``CameraInfo``: for rectified images from its matrix P, without distortion.
 
-    Numbers are those of the whole sensor; the lens is that of the region of interest after binning (REP 104).
+    The message states the intrinsics of the whole sensor; those that are returned belong to the image, which
+    is the region of interest after binning (REP 104).
 
     Raises:
         UsageError: The camera is not calibrated, or the model of its lens is unknown.
@@ -65,5 +66,5 @@ def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
 
 
 def numbers_of(message: Any, name: str) -> Array:
-    """Return ``d``, ``k``, ``r`` or ``p`` of a ``CameraInfo``; ROS 1 calls them by capital letters."""
+    """Return the array ``d``, ``k``, ``r`` or ``p`` of a ``CameraInfo``, flat; ROS 1 has capital names."""
     return np.ravel(getattr(message, name if hasattr(message, name) else name.upper()))

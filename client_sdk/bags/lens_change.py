@@ -1,4 +1,4 @@
-"""Whether two images in succession show the change of the lens that is stated between them."""
+"""Check whether two successive images show the change of the lens that a bag states between them."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from rse_pf.geometry import Array, Lens
 
 __all__ = ["mismatch_px"]
 
-_FEATURES = 600
-_FEWEST_MATCHES = 30  # fewer matches tell no lens
-_ITERATIONS = 10  # of the rotation that is fitted with the weights of a Cauchy loss
+_FEATURES = 600  # number of features that are extracted from each image
+_MIN_MATCHES = 30  # fewest matches from which a lens is checked
+_ITERATIONS = 10  # iterations of the rotation fit, which is reweighted by a Cauchy loss
 
 _Image = npt.NDArray[np.uint8]
 
 
 def mismatch_px(before: _Image, after: _Image, lens: Lens, other: Lens) -> tuple[float, float] | None:
-    """Return by how many pixels two images differ, in the median, apart from a rotation of the camera.
+    """Return the median errors, px, of a pure rotation between two images, under two hypotheses on the lens.
 
-    The first number holds if the lens changed from *lens* to *other* between them, the second if it did not;
-    for the second, the better of both lenses is taken.  A camera that drives on also moves by less than a
-    wrong focal length shifts the border of an image.
+    The first error holds if the lens changed from *lens* to *other* between the images.  The second holds if
+    it did not change; it is the smaller one of those with either lens.  The translation of the camera between
+    two images is neglected: it moves pixels less than a wrong focal length does at the border.
 
     Returns:
-        None if the images show too little.
+        None if the images have fewer than 30 matches.
     """
     first, second = describe(before, _FEATURES), describe(after, _FEATURES)
     rows, others = match_features(first, second)
-    if len(rows) < _FEWEST_MATCHES:
+    if len(rows) < _MIN_MATCHES:
         return None
     seen, again = first.pixels[rows], second.pixels[others]
     changed, *unchanged = (
@@ -41,7 +41,7 @@ def mismatch_px(before: _Image, after: _Image, lens: Lens, other: Lens) -> tuple
 
 
 def _residual(rays: Array, others: Array) -> float:
-    """Return the median angle, rad, between rays ``(n, 3)`` and others after the rotation that fits best."""
+    """Return the median angle, rad, between *rays* and *others* ``(n, 3)`` after the best rotation."""
     weights = np.ones(len(rays))
     angles = weights
     for _ in range(_ITERATIONS):

@@ -1,6 +1,6 @@
-"""Messages of ROS as objects: made from poses, paths and clouds, and to and from their bytes.
+"""Make, encode and decode ROS messages of poses, paths, point clouds and other types.
 
-It knows no bag and no node: what writes bags and what talks to ROS make the same messages.
+The writer of bags and the ROS bridge both use this module, which depends on neither bags nor ROS nodes.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ _FAULTS = (
     ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError, ValueError,
     struct.error,
 )  # fmt: skip
-_FLOAT32, _UINT32 = 7, 6
-"""Kinds of a field in ``sensor_msgs/PointField``."""
+"""Exceptions that `rosbags` raises for malformed messages, in addition to its own ones."""
+_FLOAT32 = 7  # value of FLOAT32 in ``sensor_msgs/PointField``
+_UINT32 = 6  # value of UINT32 in ``sensor_msgs/PointField``
 
 
 class MessageMaker:
-    """Makes the messages of ROS 1 or of ROS 2, and their bytes: ROS 1's own format, or CDR."""
+    """Make messages of ROS 1 or of ROS 2, and encode and decode them: in the format of ROS 1, or as CDR."""
 
     def __init__(self, *, is_ros1: bool) -> None:
-        """Take the definitions of one of both.
+        """Load the message definitions of ROS 1 or ROS 2.
 
         Raises:
             MissingExtra: ``rosbags`` is not installed.
@@ -48,15 +49,15 @@ class MessageMaker:
         self.types: Any = load_types(is_ros1=is_ros1)
 
     def encode(self, kind: str, message: Any) -> bytes:
-        """Return the bytes of a message."""
+        """Encode a message of the type *kind*."""
         serialise = self.types.serialize_ros1 if self.is_ros1 else self.types.serialize_cdr
         return bytes(serialise(message, kind))
 
     def decode(self, kind: str, data: bytes | memoryview) -> Any:
-        """Return the message that bytes hold; large fields are views into them.
+        """Decode a message of the type *kind*; its arrays may be views of *data*.
 
         Raises:
-            BrokenMessage: The bytes are not such a message.
+            BrokenMessage: The bytes are not a message of this type.
         """
         from rosbags.serde import SerdeError
         from rosbags.typesys import TypesysError
@@ -69,7 +70,10 @@ class MessageMaker:
             raise BrokenMessage(text) from error
 
     def make(self, kind: str, **fields: Any) -> Any:
-        """Return a message of a type; a header gets its number where ROS 1 has one."""
+        """Return a message of the type *kind* with these fields, which have the names of ROS 2.
+
+        For ROS 1, a header gets ``seq`` 0, and the matrices of a ``CameraInfo`` their capital names.
+        """
         if kind == "std_msgs/msg/Header" and self.is_ros1:
             fields = {"seq": 0, **fields}
         if kind == "sensor_msgs/msg/CameraInfo" and self.is_ros1:
@@ -77,23 +81,23 @@ class MessageMaker:
         return self.types.types[kind](**fields)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
-        """Return the header of a message."""
+        """Return a ``Header`` with a time stamp in nanoseconds and the name of a frame."""
         stamp = self.make(
             "builtin_interfaces/msg/Time", sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
         )
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
     def pose(self, stamp_ns: int, frame: str, T: Array) -> Any:
-        """Return a ``PoseStamped`` of a ``(4, 4)`` pose in *frame*."""
+        """Return a ``PoseStamped`` of the pose *T* ``(4, 4)``, metres, in *frame*."""
         return self.make(POSE, header=self.header(stamp_ns, frame), pose=self._pose(T))
 
     def pose_with_covariance(self, stamp_ns: int, frame: str, T: Array, covariance: Array) -> Any:
         """Return a ``PoseWithCovarianceStamped``.
 
         Args:
-            stamp_ns: Time stamp.
-            frame: That the pose is in.
-            T: ``(4, 4)``.
+            stamp_ns: Time stamp, nanoseconds.
+            frame: Name of the frame in which the pose is given.
+            T: ``(4, 4)``, the pose, metres.
             covariance: ``(6, 6)`` as ROS defines it: position, then rotation about the axes of *frame*.
         """
         made = self._with_covariance("Pose", "pose", self._pose(T), covariance)
@@ -103,9 +107,9 @@ class MessageMaker:
         """Return an ``Odometry`` whose velocity is unknown: 0 with a covariance of 1e6.
 
         Args:
-            stamp_ns: Time stamp.
-            frames: The frame that the pose is in, and the frame that is there.
-            T: ``(4, 4)``.
+            stamp_ns: Time stamp, nanoseconds.
+            frames: Names of the frame in which the pose is given, and of the frame that has this pose.
+            T: ``(4, 4)``, the pose, metres.
             covariance: ``(6, 6)`` as for `pose_with_covariance`.
         """
         still = {name: self._numbers("Vector3", np.zeros(3), "xyz") for name in ("linear", "angular")}
@@ -119,7 +123,7 @@ class MessageMaker:
         )
 
     def path_of(self, stamp_ns: int, frame: str, poses: list[Any]) -> Any:
-        """Return a ``Path`` of messages of `pose`."""
+        """Return a ``Path`` of *poses*, which `pose` made."""
         return self.make(PATH, header=self.header(stamp_ns, frame), poses=poses)
 
     def transform(self, stamp_ns: int, frame: str, child: str, T: Array) -> Any:
@@ -137,13 +141,13 @@ class MessageMaker:
         )
 
     def transforms(self, moved: list[Any]) -> Any:
-        """Return a ``TFMessage`` of messages of `transform`."""
+        """Return a ``TFMessage`` of transforms, which `transform` made."""
         return self.make(TF, transforms=moved)
 
     def imu(self, stamp_ns: int, frame: str, gyro: Array, accel: Array) -> Any:
         """Return an ``Imu`` without orientation: ``(3,)`` rad/s and ``(3,)`` m/s^2 in the axes of *frame*."""
         none = np.zeros(9)
-        none[0] = -1.0  # ROS's word for "not measured"
+        none[0] = -1.0  # by the definition of Imu, -1 means that there is no orientation
         return self.make(
             IMU,
             header=self.header(stamp_ns, frame),
@@ -161,10 +165,10 @@ class MessageMaker:
         """Return a ``PointCloud2``: x, y, z as float32, and rgb packed as ROS tools expect it.
 
         Args:
-            stamp_ns: Time stamp.
-            frame: That the points are in.
+            stamp_ns: Time stamp, nanoseconds.
+            frame: Name of the frame of the points.
             points: ``(n, 3)``, metres.
-            colours: ``(n, 3)``, red first.
+            colours: ``(n, 3)``, RGB.
         """
         layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
         rows = np.empty(len(points), dtype=layout)
@@ -193,7 +197,7 @@ class MessageMaker:
         )
 
     def diagnostics(self, stamp_ns: int, name: str, level: int, text: str, values: dict[str, str]) -> Any:
-        """Return a ``DiagnosticArray`` with one status: *level* 0 is well, 1 a warning, 2 an error."""
+        """Return a ``DiagnosticArray`` with one status; *level* is 0 for OK, 1 for a warning, 2 for error."""
         pairs = [
             self.make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()
         ]

@@ -1,8 +1,8 @@
-"""The messages of ROS that bags are read and written with, as their definitions.
+"""Definitions of the ROS messages that bags are read and written with.
 
-They are the same in every distribution, so the definitions inside a bag are not needed, and a wrong one in
-a bag cannot stop the others.  ROS 1 differs in two of them: the header has a number, and the matrices of a
-camera have capital names.
+They are the same in every distribution of ROS.  The definitions inside a bag are not used, so that a wrong
+one does no harm.  ROS 1 differs in two of them: a header has a sequence number, and the matrices of a
+``CameraInfo`` have capital names.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ _CAMERA = (
 
 @functools.cache
 def load_types(*, is_ros1: bool) -> Any:
-    """Return the `rosbags` type store of these messages.
+    """Return a type store of `rosbags` with these definitions, for ROS 1 or ROS 2.
 
     Raises:
         MissingExtra: ``rosbags`` is not installed.

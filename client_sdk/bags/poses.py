@@ -1,4 +1,4 @@
-"""The true path of the camera in a bag: from a topic of poses, or composed from the transforms of tf."""
+"""Compute the true path of the camera in a bag from a topic of poses, or from the transforms of tf."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from rse_pf.geometry import Array, from_quaternion, inverse
 __all__ = ["PoseTopic", "TransformTree"]
 
 _MAX_GAP_NS = 200_000_000
-"""No pose is given where the nearest transforms are further apart than this."""
-_MAX_DEPTH = 64
+"""Longest time, nanoseconds, between two transforms between which a pose is interpolated."""
+_MAX_DEPTH = 64  # largest number of transforms from a frame to its root: stops at cycles
 
 
 @dataclass(slots=True)
 class _Edge:
-    """The transforms from a child frame to its parent, in the order of the bag: 7 numbers each."""
+    """The poses of a child frame in its parent frame, in the order of the bag.
+
+    ``values`` has 7 numbers for each pose: position x, y, z (metres) and quaternion x, y, z, w.  A static
+    edge holds one pose, which is valid at all times.  ``ordered`` caches them by time.
+    """
 
     parent: str
     is_static: bool
@@ -35,14 +39,18 @@ class _Edge:
         norm = sum(number * number for number in numbers[3:])
         if not np.isfinite(numbers).all() or not 0.5 < norm < 2.0:
             return
-        if self.is_static:  # the latest one counts
+        if self.is_static:  # a later static transform replaces an earlier one
             del self.stamps_ns[:]
             del self.values[:]
         self.stamps_ns.append(stamp_ns)
         self.values.extend(numbers)
 
     def at(self, stamp_ns: int) -> Array | None:
-        """Return ``T_parent_child`` at a time, interpolated; None where there is none near it."""
+        """Return ``T_parent_child`` at a time, interpolated between its neighbours.
+
+        None without transforms, before the first or after the last one, or if its neighbours are more than
+        0.2 s apart.
+        """
         if not self.stamps_ns:
             return None
         if self.ordered is None:
@@ -61,13 +69,16 @@ class _Edge:
 
 
 class TransformTree:
-    """The frames of tf, and the pose of one of them in the root above it."""
+    """The tree of frames in tf, from which poses of frames are computed."""
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, message: Any, *, is_static: bool) -> None:
-        """Add a ``TFMessage``."""
+        """Add the transforms of a ``TFMessage``; *is_static* for one of ``/tf_static``.
+
+        If a frame gets another parent, its earlier transforms are dropped.
+        """
         for transform in message.transforms:
             parent, child = transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
             edge = self._edges.get(child)
@@ -78,7 +89,7 @@ class TransformTree:
             edge.add(stamp_ns, transform.transform.translation, transform.transform.rotation)
 
     def root_of(self, frame: str) -> tuple[str, bool]:
-        """Return the frame above all others of *frame*, and whether it moves against it."""
+        """Return the root of the tree that contains *frame*, and whether *frame* can move relative to it."""
         frame, moves = frame.strip("/"), False
         for _ in range(_MAX_DEPTH):
             edge = self._edges.get(frame)
@@ -89,7 +100,7 @@ class TransformTree:
         return frame, moves
 
     def pose(self, frame: str, stamp_ns: int) -> Array | None:
-        """Return ``T_root_frame`` at a time; None where it is not known."""
+        """Return ``T_root_frame`` at a time; None if a transform is missing then."""
         T = np.eye(4)
         frame = frame.strip("/")
         for _ in range(_MAX_DEPTH):
@@ -104,7 +115,7 @@ class TransformTree:
         return None
 
     def between(self, frame: str, other: str) -> Array | None:
-        """Return ``T_frame_other`` of two frames that are fixed to each other; None if they are not."""
+        """Return ``T_frame_other`` of two frames that static transforms connect; None if none do."""
         if frame.strip("/") == other.strip("/"):
             return np.eye(4)
         ways = [self._walk_fixed(end) for end in (frame, other)]
@@ -114,7 +125,10 @@ class TransformTree:
         return None
 
     def path(self, frame: str, stamps_ns: Sequence[int]) -> Trajectory | None:
-        """Return the poses of *frame* in its root at these times, where they are known."""
+        """Return the poses of *frame* in its root at those of the times at which they are known.
+
+        None if fewer than two are known.
+        """
         return _path((stamp_ns, self.pose(frame, stamp_ns)) for stamp_ns in stamps_ns)
 
     def _walk_fixed(self, frame: str) -> dict[str, Array]:
@@ -133,13 +147,13 @@ class TransformTree:
 
 
 class PoseTopic:
-    """The poses of one topic: ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry``."""
+    """The poses in a topic of ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry``."""
 
     def __init__(self) -> None:
         self._edge = _Edge(parent="", is_static=False)
 
     def add(self, message: Any) -> None:
-        """Add a message."""
+        """Add the pose of a message; one that is not finite or has no valid quaternion is left out."""
         pose = message.pose
         pose = getattr(pose, "pose", pose)
         stamp = message.header.stamp
@@ -147,12 +161,15 @@ class PoseTopic:
         self._edge.add(stamp_ns, pose.position, pose.orientation)
 
     def path(self, stamps_ns: Sequence[int]) -> Trajectory | None:
-        """Return the poses at these times, where they are known."""
+        """Return the interpolated poses at those of the times at which they are known.
+
+        None if fewer than two are known.
+        """
         return _path((stamp_ns, self._edge.at(stamp_ns)) for stamp_ns in stamps_ns)
 
 
 def _path(poses: Iterable[tuple[int, Array | None]]) -> Trajectory | None:
-    """Return the poses that are known, None if they are fewer than two."""
+    """Return the poses that are not None as a trajectory; None if they are fewer than two."""
     stamped_poses = [(stamp_ns / 1e9, T) for stamp_ns, T in poses if T is not None]
     if len(stamped_poses) < 2:
         return None
@@ -169,7 +186,10 @@ def _pose(numbers: Array) -> Array:
 
 
 def _between(one: Array, other: Array, share: float) -> Array:
-    """Return positions and rotations between two, the rotations on the shortest arc."""
+    """Interpolate between two poses of 7 numbers: positions linearly, rotations on the shortest arc (slerp).
+
+    *share* is 0 for *one* and 1 for *other*.
+    """
     mixed = (1 - share) * one + share * other
     q0 = one[3:] / np.linalg.norm(one[3:])
     q1 = other[3:] / np.linalg.norm(other[3:])

@@ -1,8 +1,8 @@
-"""What a recorder of RealSense cameras writes beside its images: the unit of depth, and where sensors sit.
+"""Read the unit of depth and the poses of the sensors from bags of the RealSense recorder.
 
-Topics are those of librealsense's file format: ``/device_0/sensor_0/Depth_0/image/data`` are images,
-``/device_0/sensor_0/option/Depth_Units/value`` metres of a unit, and ``/device_0/sensor_0/Depth_0/tf/0`` the
-transform that takes points of reference 0 to the sensor.  All frames of reference are named "0".
+Topics are those of librealsense's file format: ``/device_0/sensor_0/Depth_0/image/data`` has the images,
+``/device_0/sensor_0/option/Depth_Units/value`` the metres of one unit of depth, and
+``/device_0/sensor_0/Depth_0/tf/0`` the transform from the reference frame 0 to the sensor.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _IMAGES = "/image/data"
 
 
 def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:
-    """Return how many metres a unit of the topic *depth* is; None if the bag does not state it."""
+    """Return the metres of one unit of the depth images of the topic *depth*; None if the bag states none."""
     stream = _stream_of(depth)
     if not stream:
         return None
@@ -35,7 +35,10 @@ def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:
 
 
 def stated_T_colour_depth(file: BagFile, colour: str, depth: str) -> Array | None:
-    """Return ``(4, 4)`` from the frame of *depth* to that of *colour*; None if the bag does not state it."""
+    """Return the transform ``(4, 4)``, metres, from the frame of the topic *depth* to that of *colour*.
+
+    None if the bag does not state it.
+    """
     mounts = [_first(file, f"{_stream_of(topic)}/tf/", TRANSFORM) for topic in (colour, depth)]
     if not (_stream_of(colour) and _stream_of(depth)) or mounts[0] is None or mounts[1] is None:
         return None
@@ -49,7 +52,10 @@ def _stream_of(topic: str) -> str:
 
 
 def _first(file: BagFile, start: str, kind: str) -> Any | None:
-    """Return the first good message of the topics of one type whose names have this start."""
+    """Return the first message of the topics of type *kind* whose names begin with *start*.
+
+    None if there is none, or if it is malformed.
+    """
     names = [topic.name for topic in file.topics if topic.kind == kind and topic.name.startswith(start)]
     try:
         return next((file.parse(raw) for raw in file.messages(names)), None)

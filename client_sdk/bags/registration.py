@@ -1,4 +1,4 @@
-"""Move the readings of a depth camera into the image of a colour camera."""
+"""Register depth images: project the readings of a depth camera into the image of a colour camera."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from rse_pf.geometry import Array, Camera, transform
 
 __all__ = ["register_depth"]
 
-_MIN_DEPTH_M = 0.01
+_MIN_DEPTH_M = 0.01  # smallest depth in the colour camera, metres, of a reading that is used
 
 
 def register_depth(
     depth_m: npt.NDArray[np.float32], depth_camera: Camera, T_colour_depth: Array, colour_camera: Camera
 ) -> npt.NDArray[np.float32]:
-    """Return the depth as the colour camera would see it; where two readings meet, the nearer one counts.
+    """Return the depth image of the colour camera, metres, 0 for pixels without a reading.
 
-    A reading of a coarser depth camera fills the pixels of its area.
+    If several readings are projected to one pixel, the nearest is used.  If the depth camera has a smaller
+    focal length in pixels, each reading fills a square of pixels.
 
     Args:
-        depth_m: ``(h, w)`` of *depth_camera*, metres, without distortion, 0 where there is no reading.
-        depth_camera: Its camera.
-        T_colour_depth: ``(4, 4)``, from the frame of the depth camera to that of the colour camera.
-        colour_camera: The camera whose pixels are wanted.
+        depth_m: ``(h, w)``, undistorted depth image of the depth camera, metres, 0 without a reading.
+        depth_camera: Pinhole camera of the depth image.
+        T_colour_depth: ``(4, 4)``, metres, from the frame of the depth camera to that of the colour camera.
+        colour_camera: Pinhole camera of the result.
     """
     rows, columns = np.nonzero(depth_m)
     depths = depth_m[rows, columns].astype(np.float64)
     pixels = np.stack((columns, rows), axis=1).astype(np.float64)
     points = transform(T_colour_depth, depth_camera.back_project(pixels, depths))
     points = points[points[:, 2] > _MIN_DEPTH_M]
-    # The nearer one is written last, so it stays.
+    # Sort the readings from far to near: of several readings in one pixel, the nearest is written last.
     points = points[np.argsort(-points[:, 2], kind="stable")]
     registered_m = np.zeros((colour_camera.height, colour_camera.width), dtype=np.float32)
     spread = max(1, math.ceil(colour_camera.fx / depth_camera.fx - 1e-6))
@@ -45,7 +46,7 @@ def register_depth(
             if spread == 1:
                 registered_m[y[inside], x[inside]] = seen
                 continue
-            # Between the areas of several readings the nearer one must win, whichever came last.
+            # The squares of several readings overlap: the nearest reading counts, not the last one.
             layer = np.zeros_like(registered_m)
             layer[y[inside], x[inside]] = seen
             registered_m = np.where(

@@ -1,4 +1,4 @@
-"""The two cameras of a stereo pair in a bag, as their ``CameraInfo`` and tf describe them."""
+"""Read the two cameras of a stereo pair from their ``CameraInfo`` messages and from tf."""
 
 from __future__ import annotations
 
@@ -15,33 +15,35 @@ from rse_pf.geometry import Array, inverse, rigid
 __all__ = ["CameraMessage", "pair_of"]
 
 _HINT = "give both cameras yourself: --intrinsics rig.json; or take one: --no-depth"
-_MOST_NUMBERS = 5
-"""Of the distortion of a lens of a rig."""
+_MAX_COEFFICIENTS = 5
+"""Largest number of distortion coefficients that are not 0 of a camera in a rig."""
 
-_MAX_BASELINE_M = 10.0
+_MAX_BASELINE_M = 10.0  # largest distance, metres, of both cameras: a larger one is in a wrong unit
 
 CameraMessage = tuple[str, Any, bool]
-"""Name of the topic, its ``CameraInfo``, and whether the images are rectified already."""
+"""A camera of a bag: the name of its ``CameraInfo`` topic, the message, and whether its images are rectified
+already."""
 
 
 def pair_of(
     left: CameraMessage, right: CameraMessage, T_left_right: Array | None
 ) -> tuple[RigCamera, RigCamera]:
-    """Return both cameras; the body is the left one.
+    """Return the left and the right camera of a rig whose body frame is that of the left camera.
 
-    Where P of both messages states a distance, P and R tell the place of the right camera, as ROS defines
-    them: ``P[3] = -f b``, and R turns a camera into its rectified one.  Otherwise tf does.
+    If the matrices P state a baseline, the pose of the right camera is computed from P and R as ROS defines
+    them: ``P[3] = -f b`` for the baseline b, and R rotates a camera into its rectified one.  Otherwise it is
+    *T_left_right*.
 
     Args:
-        left: Of the left camera.
-        right: Of the right one.
-        T_left_right: ``(4, 4)``, pose of the right camera's frame in the left one's; None if tf has none.
+        left: The left camera.
+        right: The right camera.
+        T_left_right: ``(4, 4)``, metres, pose of the right camera in the left one by tf; None if unknown.
 
     Raises:
-        UsageError: A lens cannot be used, or the place of the right camera is not known.
+        UsageError: A lens cannot be used, or the pose of the right camera is not known or too far away.
     """
     T_rectified = [_rectified_from(*each) for each in (left, right)]
-    steps = [_step(name, message) for name, message, _ in (left, right)]
+    steps = [_baseline_of(name, message) for name, message, _ in (left, right)]
     aside = steps[0] - steps[1]
     if aside.any():
         T_rectified_right = np.eye(4)
@@ -67,7 +69,10 @@ def pair_of(
 
 
 def _rectified_from(name: str, message: Any, is_rectified: bool) -> Array:
-    """Return the ``(4, 4)`` turn from what images show, rectified or not, to the rectified camera."""
+    """Return the rotation ``(4, 4)`` from the camera of the images to the rectified camera.
+
+    The identity if the images are rectified already, or if the message states no R.
+    """
     T = np.eye(4)
     R = numbers_of(message, "r").reshape(3, 3)
     if is_rectified or not np.any(R):
@@ -79,8 +84,11 @@ def _rectified_from(name: str, message: Any, is_rectified: bool) -> Array:
     return turn
 
 
-def _step(name: str, message: Any) -> Array:
-    """Return ``(2,)``, metres: what P of a camera adds to the points of the rectified left one."""
+def _baseline_of(name: str, message: Any) -> Array:
+    """Return the translation ``(2,)``, metres, that P of a camera states: ``P[3] / fx`` and ``P[7] / fy``.
+
+    It takes points of the rectified left camera to this one; 0 if P states no focal lengths.
+    """
     P = numbers_of(message, "p")
     if not np.isfinite(P).all():
         raise UsageError(f"P of {name} holds a number that is not finite", hint=_HINT)
@@ -91,9 +99,10 @@ def _step(name: str, message: Any) -> Array:
 
 def _intrinsics(name: str, message: Any, is_rectified: bool) -> Intrinsics:
     lens = lens_of(message, name, is_rectified=is_rectified)
-    if any(lens.distortion[_MOST_NUMBERS:]):
+    if any(lens.distortion[_MAX_COEFFICIENTS:]):
         raise UsageError(
-            f"{name} has a lens of {len(lens.distortion)} distortion numbers, a pair takes {_MOST_NUMBERS}",
+            f"{name} has a lens of {len(lens.distortion)} distortion numbers, a pair takes "
+            f"{_MAX_COEFFICIENTS}",
             hint=_HINT,
         )
-    return Intrinsics(camera=lens.camera, distortion=lens.distortion[:_MOST_NUMBERS], model=lens.model)
+    return Intrinsics(camera=lens.camera, distortion=lens.distortion[:_MAX_COEFFICIENTS], model=lens.model)

@@ -1,6 +1,6 @@
-"""Raw images of a bag by their time stamps: in order without seeking, in any other order by seeking.
+"""Fetch raw images of a bag by their time stamps; ascending stamps are read without seeking.
 
-At most `_MAX_WAITING_BYTES` of messages wait for their turn.
+Messages that were read before they are wanted are kept, at most `_MAX_WAITING_BYTES` of them.
 """
 
 from __future__ import annotations
@@ -14,15 +14,19 @@ from rse_pf.errors import UsageError
 __all__ = ["ImageStream", "WantedImage"]
 
 WantedImage = tuple[str, int, int]
-"""Topic, stamp of the message and time of writing, nanoseconds."""
+"""An image of a bag: its topic, its time stamp, and the time at which it was written to the bag, both in
+nanoseconds."""
 
-_MAX_WAITING_BYTES = 64 * 1024 * 1024
-_SKIP_NS = 2_000_000_000
-"""A gap over which seeking is faster than reading on."""
+_MAX_WAITING_BYTES = 64 * 1024 * 1024  # largest size of the messages that are kept for later calls
+_MAX_READ_THROUGH_NS = 2_000_000_000
+"""Longest gap, nanoseconds, that is read through; over longer ones, seeking is faster."""
 
 
 class ImageStream:
-    """Read the wanted messages of some topics of an open bag."""
+    """Fetch images of the given topics from an open bag.
+
+    With *use_log_time*, the time of writing takes the place of the time stamp in `WantedImage`.
+    """
 
     def __init__(self, file: BagFile, topics: Sequence[str], *, use_log_time: bool) -> None:
         self._file = file
@@ -34,10 +38,12 @@ class ImageStream:
         self._waiting_bytes = 0
 
     def take(self, wanted: Sequence[WantedImage]) -> list[RawMessage]:
-        """Return these messages; earlier ones are forgotten.
+        """Return the messages of the *wanted* images in their order.
+
+        Kept messages up to the oldest of their time stamps are dropped.
 
         Raises:
-            UsageError: The bag does not hold them any more.
+            UsageError: The bag no longer holds one of the messages: it has changed.
         """
         missing = {image: image[2] for image in wanted}
         for key in list(missing):
@@ -45,10 +51,10 @@ class ImageStream:
                 del missing[key]
         if missing:
             start_ns = min(missing.values())
-            if self._messages is None or not self._at_ns <= start_ns <= self._at_ns + _SKIP_NS:
+            if self._messages is None or not self._at_ns <= start_ns <= self._at_ns + _MAX_READ_THROUGH_NS:
                 self._seek(start_ns)
             if not self._read(missing, until_ns=max(missing.values())):
-                # Two messages of one time, or two files of one bag, may stand in any order: look again.
+                # Messages with one time, or of two files of a bag, may be in any order: search to the end.
                 self._seek(start_ns)
                 if not self._read(missing, until_ns=None):
                     raise UsageError(
@@ -61,7 +67,7 @@ class ImageStream:
         return taken
 
     def close(self) -> None:
-        """Forget all messages."""
+        """Drop all kept messages."""
         self._messages = None
         self._waiting.clear()
         self._waiting_bytes = 0
@@ -71,7 +77,10 @@ class ImageStream:
         self._at_ns = start_ns
 
     def _read(self, missing: dict[WantedImage, int], until_ns: int | None) -> bool:
-        """Read on until no message is missing; return False at the end of the bag, or of that time."""
+        """Read on until no image is *missing*, and return whether that succeeded.
+
+        False at the end of the bag, at damage, or after the first message that was written after *until_ns*.
+        """
         assert self._messages is not None
         while missing:
             try:
@@ -80,12 +89,12 @@ class ImageStream:
                 raw = None
             if raw is None:
                 return False
-            self._keep(raw, missing)
+            self._store(raw, missing)
             if until_ns is not None and raw.log_ns > until_ns:
                 break
         return not missing
 
-    def _keep(self, raw: RawMessage, missing: dict[WantedImage, int]) -> None:
+    def _store(self, raw: RawMessage, missing: dict[WantedImage, int]) -> None:
         self._at_ns = max(self._at_ns, raw.log_ns)
         try:
             stamp_ns = raw.log_ns if self._use_log_time else self._file.stamp_ns(raw)

@@ -1,6 +1,6 @@
-"""Write bags without ROS: messages of any topic, and what a robot mapped, as a path and a cloud.
+"""Write bags without ROS: messages of any topic, and maps as paths and a point cloud.
 
-It replaces no file that is there.
+Existing files are never replaced.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from rse_pf.errors import MissingExtra, UsageError
 __all__ = ["BagKind", "BagWriter", "write_map_bag"]
 
 BagKind = Literal["ros1", "sqlite3", "mcap"]
-_FILE_ENDINGS = {"sqlite3": ".db3", "mcap": ".mcap"}
+"""Format of a bag: a ROS 1 bag, or a ROS 2 bag that is stored as sqlite3 or MCAP."""
+_FILE_ENDINGS = {"sqlite3": ".db3", "mcap": ".mcap"}  # endings of the files of ROS 2 bags
 
 
 class BagWriter(MessageMaker, AutoClose):
-    """A new bag; use it in ``with``.
+    """Write a new bag, in ``with``, which creates and closes it.
 
-    ``ros1`` writes one ``.bag`` file, ``sqlite3`` and ``mcap`` the folder of a ROS 2 bag.
+    For ``ros1`` *path* is a ``.bag`` file, for ``sqlite3`` and ``mcap`` the folder of a ROS 2 bag.
     """
 
     def __init__(self, path: Path, kind: BagKind, *, is_compressed: bool = False) -> None:
@@ -40,7 +41,7 @@ class BagWriter(MessageMaker, AutoClose):
         self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> BagWriter:
-        """Make the bag; raises UsageError where that is not possible."""
+        """Create the bag; raises UsageError if it exists already, or cannot be written."""
         if self.path.exists():
             raise UsageError(f"{self.path} exists already", hint="name another place, or remove it")
         try:
@@ -57,11 +58,11 @@ class BagWriter(MessageMaker, AutoClose):
         self._writer.close()
 
     def write(self, topic: str, kind: str, log_ns: int, message: Any) -> None:
-        """Write a message at a time of the bag, nanoseconds."""
+        """Write a message of the type *kind*; *log_ns* is its time of writing in the bag, nanoseconds."""
         self.write_bytes(topic, kind, log_ns, self.encode(kind, message))
 
     def write_bytes(self, topic: str, kind: str, log_ns: int, data: bytes) -> None:
-        """Write the bytes of a message as they are."""
+        """Write an encoded message of the type *kind*; *log_ns* as in `write`."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.types)
         self._writer.write(self._connections[topic], log_ns, data)
@@ -95,17 +96,18 @@ def write_map_bag(
     *,
     frame: str = "map",
 ) -> int:
-    """Write a map as a bag that ROS tools show; return how many messages it has.
+    """Write a map as a bag that ROS tools can display, and return the number of its messages.
 
-    Each robot gets a topic of poses, a path and its transform in tf; the cloud is one ``PointCloud2`` with
-    colours.  Times are those of the trajectories.
+    Each robot gets a topic of poses, a topic with its path, and transforms in ``/tf``; the points are one
+    ``PointCloud2`` with colours.  Times of messages are those of the trajectories.
 
     Args:
-        path: The new bag.
-        kind: Its format.
-        trajectories: Names of robots and their paths.
+        path: File or folder of the new bag.  A path with the ending of a file of a ROS 2 bag gets that file
+            alone, without a folder.
+        kind: Format of the bag.
+        trajectories: Names of robots with their trajectories.
         points: ``(n, 3)``, metres.
-        colours: ``(n, 3)``, red first.
+        colours: ``(n, 3)``, RGB.
         frame: Name of the world frame.
 
     Raises:
@@ -115,7 +117,7 @@ def write_map_bag(
     if path.exists():
         raise UsageError(f"{path} exists already", hint="name another place, or remove it")
     if kind != "ros1" and path.suffix in _FILE_ENDINGS.values():
-        # One file of a ROS 2 bag: the folder around it is made beside it, and removed.
+        # The library writes a folder: write it to a temporary place, and move the file out of it.
         with TemporaryDirectory(prefix=".bag-", dir=path.absolute().parent) as folder:
             whole = Path(folder) / path.stem
             count = _write_map(whole, kind, list(trajectories), points, colours, frame)
