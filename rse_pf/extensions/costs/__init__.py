@@ -1,4 +1,4 @@
-"""What a deployment costs on AWS: an estimate from one dated table of prices.
+"""Estimate what a deployment costs on AWS, from one dated table of prices.
 
-Nothing here calls AWS.
+This package does not call AWS.
 """

@@ -1,8 +1,9 @@
-"""Estimate what a deployment costs a month: line by line, by box of Fig. 2, and on the Lambda alone.
+"""Estimate the monthly costs of a deployment: line by line, by component of the architecture (Fig. 2 of the
+paper), and for the Lambda function alone.
 
-A server accepts commands up to ``scaling.busy_cpu_percent``; the fleet has as many servers as that needs, but
-never fewer than ``scaling.min_servers``.  A sum is always the sum of its lines, each rounded to a cent.  What
-the estimate leaves out is in `NOT_INCLUDED`.
+A server is used up to a CPU load of ``scaling.busy_cpu_percent``; the fleet has as many servers as the
+commands need then, but at least ``scaling.min_servers``.  Each line is rounded to a cent before lines are
+added. `NOT_INCLUDED` lists the costs that the estimate leaves out.
 """
 
 from __future__ import annotations
@@ -43,9 +44,10 @@ __all__ = [
     "servers_needed",
 ]
 
-# Hours of a month, as in the calculator of AWS.
+# Hours of a month, as in the price calculator of AWS.
 HOURS = 730.0
-DAY_H = 24.0
+DAY_H = 24.0  # hours of a day
+# Costs that the estimate leaves out, as the command prints them.
 NOT_INCLUDED = (
     "taxes, data out to the robots (the same for fleet and Lambda), inspection by the firewall "
     "(except of burst commands), requests to S3, stored maps and logs, copies in other regions, "
@@ -60,24 +62,26 @@ _BYTES_OF_A_UNIT = 1e9
 _BALANCER_ZONES = 2
 # Metrics that EC2 publishes each minute for a server with detailed monitoring.
 _DETAILED_METRICS = 7
-# Metrics that the agent of a server with robots reads each period: the numbers of robots and of servers.
+# Number of metrics that the agent of a server with robots reads in each period: robots, and servers.
 _READ_METRICS = 2
-# Rules of the web ACL in addition to the rate limits: one refuses burst commands without a token.
+# Number of rules of the web ACL in addition to the rate limits: one refuses burst commands without a token.
 _TOKEN_RULES = 1
-# An alarm with a shorter period than this is priced higher.
+# AWS has a higher price for alarms with a period below this one, in seconds.
 _FAST_BELOW_S = 60
-# Time that one call of the canary takes.
+# Assumed duration of one call of the canary, seconds.
 _CANARY_S = 1.0
 
 Needs = Literal["servers", "balancer", "always"]
-"""The resources whose removal ends the costs of a line; ``always`` lines stay while parked."""
+"""The resources for which a line is paid: ``servers``, ``balancer`` for load balancer, firewall and
+endpoints, or ``always`` for lines that are paid even while the platform is parked (without servers)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Load:
-    """How many robots send how many commands, and for how long each day.
+    """The load of a deployment.
 
-    ``burst_commands_per_day`` are answered by the Lambda in addition to the fleet.
+    ``robots`` robots send ``fps`` commands per second each, for ``hours_per_day`` hours.  The Lambda function
+    answers ``burst_commands_per_day`` more commands, of all robots together.
     """
 
     robots: int = 0
@@ -87,18 +91,22 @@ class Load:
 
     @property
     def commands_per_s(self) -> float:
-        """Return the commands per second of all robots together, in their hours."""
+        """The commands per second of all robots together while they work."""
         return self.robots * self.fps
 
     @property
     def hours(self) -> float:
-        """Return the hours of a month in which the robots are at work."""
+        """The hours of a month in which the robots work."""
         return HOURS * self.hours_per_day / DAY_H
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CostLine:
-    """One line of a bill: *count* units of *unit* in a month at *price* each; *box* is one of Fig. 2."""
+    """One line of a bill: *count* of *unit* in a month at *price* each.
+
+    *box* is the component of the architecture (Fig. 2 of the paper), *what* the name of the line, and *needs*
+    the resources for which it is paid.
+    """
 
     box: str
     what: str
@@ -109,23 +117,23 @@ class CostLine:
 
     @property
     def amount(self) -> float:
-        """Return what the line costs a month, rounded to a cent."""
+        """The costs of the line in a month, rounded to a cent, in the currency of the prices."""
         return round(self.count * self.price, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Bill:
-    """What a month costs, in the currency of the prices."""
+    """The lines of a monthly bill, in the currency of the prices."""
 
     lines: tuple[CostLine, ...]
 
     @property
     def total(self) -> float:
-        """Return the sum of the lines."""
+        """The sum of the rounded amounts of all lines."""
         return round(sum(line.amount for line in self.lines), 2)
 
     def sum_by_box(self) -> dict[str, float]:
-        """Return the sum of each box, in the order of the lines."""
+        """Return the sum of the lines of each component (`CostLine.box`), in the order of the lines."""
         sums: dict[str, float] = {}
         for line in self.lines:
             sums[line.box] = round(sums.get(line.box, 0.0) + line.amount, 2)
@@ -133,10 +141,10 @@ class Bill:
 
 
 def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None) -> Bill:
-    """Return the bill of a month with *load*; without it, of a month without any robot.
+    """Return the bill of a month with *load*, without robots for None; lines with the count 0 are left out.
 
     Raises:
-        ConfigurationError: The price of ``cloud.instance_type`` is not known.
+        ConfigurationError: The table has no price of ``cloud.instance_type``.
     """
     load = load or Load()
     lines = (
@@ -149,38 +157,42 @@ def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None
 
 
 def parked(bill: Bill, *, deep: bool) -> Bill:
-    """Return what is left of *bill* without servers.
+    """Return the lines of *bill* that are paid while the platform is parked, without servers.
 
-    If *deep*, load balancer, firewall and endpoints are gone, too.
+    If *deep*, load balancer, firewall and endpoints are removed, too.
     """
     gone: tuple[Needs, ...] = ("servers", "balancer") if deep else ("servers",)
     return Bill(tuple(line for line in bill.lines if line.needs not in gone))
 
 
 def lambda_alone(prices: Prices, load: Load) -> float:
-    """Return what a month costs if the Lambda answers every command of *load*."""
+    """Return the unrounded costs of a month if the Lambda function answers every command of the robots."""
     commands = load.commands_per_s * load.hours * _HOUR_S
     return sum(line.count * line.price for line in _lambda_lines(prices, commands))
 
 
 def lambda_executions(prices: Prices, load: Load) -> float:
-    """Return how many executions the Lambda needs at the same time to answer every command of *load*."""
+    """Return the mean number of concurrent Lambda executions that answer every command of the robots."""
     return load.commands_per_s * _billed_ms(prices) / 1e3
 
 
 def servers_needed(settings: PlatformSettings, prices: Prices, load: Load) -> int:
-    """Return how many servers the fleet has while the robots are at work."""
+    """Return the number of servers of the fleet while the robots work.
+
+    That is the largest number of ``scaling.min_servers``, the servers for the commands, and the servers for
+    the connections of the robots (``serving.max_robots``).
+    """
     vcpus = prices.server(settings.cloud.instance_type).vcpus
     capacity_per_s = vcpus * settings.scaling.busy_cpu_percent / 100 / (prices.command_cpu_ms / 1e3)
     return max(
         settings.scaling.min_servers,
-        math.ceil(round(load.commands_per_s / capacity_per_s, 9)),  # 3.0000000001 servers are three
+        math.ceil(round(load.commands_per_s / capacity_per_s, 9)),  # rounding errors must not add a server
         math.ceil(load.robots / settings.serving.max_robots),
     )
 
 
 def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> list[CostLine]:
-    """Return what running servers cost, and the volumes of stopped ones."""
+    """Return the lines of running servers with their metrics, and of the volumes of stopped servers."""
     kind, price = settings.cloud.instance_type, prices.server(settings.cloud.instance_type)
     floor, busy = settings.scaling.min_servers, servers_needed(settings, prices, load)
     hours = HOURS * floor + load.hours * (busy - floor)
@@ -208,7 +220,7 @@ def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> lis
 
 def _balancer_lines(settings: PlatformSettings, prices: Prices, load: Load) -> list[CostLine]:
     """Return the lines of load balancer, firewall, and interface endpoints."""
-    # AWS counts connections or bytes, whichever costs more; a robot connects once.
+    # AWS bills connections or bytes, whichever costs more; each robot has one connection.
     by_connections = load.robots / _CONNECTIONS_OF_A_UNIT
     by_bytes = load.commands_per_s * _HOUR_S * prices.command_bytes / _BYTES_OF_A_UNIT
     units = max(by_connections, by_bytes) * load.hours
@@ -229,7 +241,7 @@ def _balancer_lines(settings: PlatformSettings, prices: Prices, load: Load) -> l
 
 
 def _standing_lines(settings: PlatformSettings, prices: Prices) -> list[CostLine]:
-    """Return what a parked platform pays as well: alarms, canary and secrets."""
+    """Return the lines that are paid even while the platform is parked: alarms, canary and secrets."""
     calling = [(len(alarm.series), alarm.period_s) for alarm in operator_alarms(settings)]
     scaling = [(len(alarm.metrics), alarm.period_s) for alarm in alarms_of(settings.scaling)]
     secrets = 2.0 if settings.cloud.canary else 1.0
@@ -251,7 +263,7 @@ def _standing_lines(settings: PlatformSettings, prices: Prices) -> list[CostLine
 
 
 def _lambda_lines(prices: Prices, commands: float) -> list[CostLine]:
-    """Return what the Lambda costs for *commands* in a month."""
+    """Return the lines of the Lambda function for a number of *commands* in a month."""
     millions = commands / 1e6
     gb_s = commands * LAMBDA_MEMORY_MB / 1024 * _billed_ms(prices) / 1e3
     rows = (
@@ -263,12 +275,12 @@ def _lambda_lines(prices: Prices, commands: float) -> list[CostLine]:
 
 
 def _billed_ms(prices: Prices) -> int:
-    """Return the time of a warm execution, rounded up to a millisecond; it was measured on a server."""
+    """Return the billed time of a warm Lambda execution: ``command_cpu_ms``, rounded up to a millisecond."""
     return math.ceil(prices.command_cpu_ms)
 
 
 def _count_published_metrics() -> tuple[int, int]:
-    """Return how many metrics the agents publish for the fleet, and how many more for each server."""
+    """Return the number of metrics that are published for the fleet, and that for each server."""
     data = datums(ServerMetrics(), ServerMetrics(answers={1.0: 1.0}), "fleet", "server")
     of_server = sum(len(datum["Dimensions"]) > 1 for datum in data)
     return len(data) - of_server, of_server

@@ -1,8 +1,8 @@
-"""The prices that an estimate is made from: one dated table for one region, without taxes.
+"""Read the prices for an estimate of costs: one dated table for one region, without taxes.
 
 `rse_pf/extensions/costs/prices.json` holds the table of the release.  A file ``prices.json`` in the folder of
-cdk.json, or ``rse-pf cloud cost --prices FILE``, replaces all prices or some; it should also name its own
-``as_of``, ``region`` and ``source``.
+cdk.json, or the file of ``rse-pf cloud cost --prices FILE``, replaces some or all of its values; it should
+also state its own ``as_of``, ``region`` and ``source``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rse_pf.errors import ConfigurationError
 
 __all__ = ["PRICES_FILE", "STALE_DAYS", "Prices", "ServerPrice", "load_prices", "operators_prices"]
 
-# Name of the operator's own table, in the folder of cdk.json.
+# Name of the file in the folder of cdk.json with which an operator replaces prices.
 PRICES_FILE = "prices.json"
-# Prices that are older than this many days are called stale: AWS changes some of them every year.
+# Age in days above which a warning calls prices stale: AWS changes some prices every year.
 STALE_DAYS = 365
 
 _TABLE_OF_THE_RELEASE = Path(__file__).with_name("prices.json")
@@ -30,7 +30,7 @@ _Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class ServerPrice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One EC2 type; the price of a Spot instance changes from hour to hour."""
+    """Number of vCPUs and prices of an EC2 instance type; Spot prices change from hour to hour."""
 
     vcpus: _Count
     per_hour: _Price
@@ -38,30 +38,30 @@ class ServerPrice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The table; amounts are in `currency`.
+    """A table of prices in the currency *currency*, and the measured costs of a command.
 
     Attributes:
-        as_of: The day on which these prices held.
+        as_of: Day on which these prices were valid, ``YYYY-MM-DD``.
+        region: AWS region for which they are valid.
+        currency: Currency of all prices, such as ``USD``.
         source: Where the prices were read, and by whom.
-        servers: By EC2 type.
-        volume_per_gb_month: Of a gp3 volume.
-        metric_per_month: One detailed or custom metric.
-        alarm_metric_per_month: One metric in an alarm of standard resolution.
-        alarm_fast_metric_per_month: One metric in an alarm with a period below a minute.
-        metric_calls_per_thousand: A thousand requests that publish metrics, or metrics that are read.
-        balancer_per_hour: The load balancer without its addresses.
-        balancer_unit_per_hour: One capacity unit: 3000 connections, or 1 GB an hour.
-        address_per_hour: One public IPv4 address.
-        endpoint_per_hour: One interface endpoint in one zone.
-        firewall_per_month: One web ACL.
-        firewall_rule_per_month: One rule of it.
-        firewall_per_million: A million requests that the web ACL inspects.
-        secret_per_month: One secret.
-        stored_per_gb_month: One GB in S3, standard storage.
-        lambda_per_million: A million executions.
-        lambda_per_gb_s: A gigabyte of memory for a second, x86-64.
-        command_cpu_ms: CPU time of a PnP command, its socket included; measured.
-        command_bytes: One PnP command on the wire: 200 matches, zlib; measured.
+        servers: Prices of EC2 instances, by instance type.
+        volume_per_gb_month: Price of one GB of a gp3 volume for a month.
+        metric_per_month: Price of one detailed or custom CloudWatch metric for a month.
+        alarm_metric_per_month: Price of one metric in an alarm of standard resolution for a month.
+        alarm_fast_metric_per_month: Price of one metric in an alarm with a period below a minute.
+        metric_calls_per_thousand: Price of a thousand requests that publish metrics, or metrics that are
+        read. balancer_per_hour: Price of the load balancer for an hour, without its addresses.
+        balancer_unit_per_hour: Price of one capacity unit for an hour: 3000 connections, or 1 GB an hour.
+        address_per_hour: Price of one public IPv4 address for an hour. endpoint_per_hour: Price of one
+        interface endpoint in one zone for an hour. firewall_per_month: Price of one web ACL for a month.
+        firewall_rule_per_month: Price of one rule of a web ACL for a month. firewall_per_million: Price of a
+        million requests that the web ACL inspects. secret_per_month: Price of one secret for a month.
+        stored_per_gb_month: Price of one GB in S3 standard storage for a month. lambda_per_million: Price of
+        a million executions of a Lambda function. lambda_per_gb_s: Price of one GB of memory of a Lambda
+        function for a second, x86-64. command_cpu_ms: Measured CPU time, ms, of a PnP command with the work
+        of its WebSocket connection. command_bytes: Measured size, bytes, of the message of a PnP command with
+        200 matches in ``zlib``.
     """
 
     as_of: Annotated[str, msgspec.Meta(pattern=r"^\d{4}-\d{2}-\d{2}$")]
@@ -99,7 +99,10 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return price
 
     def warnings(self, *, today: date, region: str) -> list[str]:
-        """Return what is wrong with these prices for an estimate of today in *region*."""
+        """Return lines that warn of prices that are too old *today*, or of another region than *region*.
+
+        Empty if the prices are valid.
+        """
         lines = []
         days = (today - date.fromisoformat(self.as_of)).days
         if days > STALE_DAYS:
@@ -112,10 +115,11 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def load_prices(over: Path | None = None) -> Prices:
-    """Return the table of the release with the values of the file *over* in place of its own.
+    """Return the prices of the release; values in the file *over* replace those of the release.
 
     Raises:
-        ConfigurationError: *over* is not readable, is not a JSON object, or holds a value that is no price.
+        ConfigurationError: *over* cannot be read, is not a JSON object, or holds an unknown name or an
+            invalid value.
     """
     values: dict[str, Any] = msgspec.json.decode(_TABLE_OF_THE_RELEASE.read_bytes())
     if over is None:
@@ -143,7 +147,7 @@ def operators_prices(path: Path | None, folder: Path) -> Prices:
     """Return the prices in the file *path*, else in `PRICES_FILE` of *folder*, else those of the release.
 
     Raises:
-        ConfigurationError: As `load_prices`.
+        ConfigurationError: The file is invalid, see `load_prices`.
     """
     own = folder / PRICES_FILE
     return load_prices(path or (own if own.exists() else None))
