@@ -32,6 +32,7 @@ __all__ = [
     "register_depth",
 ]
 
+# Pinhole cameras and distortion coefficients (k1 k2 p1 p2 k3) of the data set's Kinect, from its toolbox.
 COLOUR_CAMERA = Camera(
     fx=518.85790117450188,
     fy=519.46961112127485,

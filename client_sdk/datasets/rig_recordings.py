@@ -49,6 +49,7 @@ from rse_pf.geometry import Array, from_quaternion
 __all__ = ["CameraChoice", "is_euroc", "is_kitti", "open_euroc", "open_kitti"]
 
 CameraChoice = Literal["stereo", "left"]
+"""The cameras of a stereo rig that are used: both, or the left one alone."""
 
 _EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"  # file of the true trajectory in the folder mav0
 _MAX_PAIR_DIFFERENCE_S = 0.005

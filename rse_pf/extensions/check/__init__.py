@@ -1,4 +1,4 @@
-"""The verb check, which tracks a drive on this machine and shows what is wrong with it.
+"""The command ``rse-pf check``: track a drive on this machine, and show its faults.
 
-How faults are found belongs to `client_sdk.check`.
+The faults are found by `client_sdk.check`.
 """

@@ -41,14 +41,14 @@ if TYPE_CHECKING:
 __all__ = ["ACTION"]
 
 _MAX_DEVICE_FRAMES = 3000
-"""Number of frames of a device that are checked unless --frames gives another number."""
-_OF_RECORDINGS = ("rgb.txt", "intrinsics.json", "metadata.yaml")
-"""Folders with one of these are recordings or bags, whatever report somebody left in them."""
+"""Number of frames of a live camera that are checked unless ``--frames`` gives another number."""
+_RECORDING_FILES = ("rgb.txt", "intrinsics.json", "metadata.yaml")
+"""A folder with one of these files is a recording or a bag, and is checked even if it has a report.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckDriveRequest(SensorRequest, AcceptRequest):
-    """A drive that is checked, and where the findings are written."""
+    """The options of ``rse-pf check``."""
 
     source: str = option(
         metavar="SOURCE", help="a recording, bag, folder, video, device, or results of a map"
@@ -71,14 +71,18 @@ class CheckDriveRequest(SensorRequest, AcceptRequest):
 
 
 def check_drive(request: CheckDriveRequest, settings: PlatformSettings) -> int:
-    """Check one drive; the exit code is 1 if something is wrong with it."""
+    """Run ``rse-pf check``; return the exit code.
+
+    It is 1 if there is a finding, a doubt about the source that the user has not accepted, or no frame with a
+    pose; else 0.  For a folder with the results of a map, the findings in its report.json are shown.
+    """
     if request.frames is not None and request.frames < 2:
         raise UsageError(f"--frames {request.frames} is below 2", hint="leave it out to look at all frames")
     if request.write is not None and not request.write.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {request.write.absolute().parent}", hint="create it")
     folder = Path(request.source)
     results = folder / "report.json"
-    if results.is_file() and not any((folder / name).exists() for name in _OF_RECORDINGS):
+    if results.is_file() and not any((folder / name).exists() for name in _RECORDING_FILES):
         return _show_results(request, results)
     require("check")
     check_accepted(request.accept)
@@ -102,7 +106,7 @@ def check_drive(request: CheckDriveRequest, settings: PlatformSettings) -> int:
 
 
 def _show_results(request: CheckDriveRequest, file: Path) -> int:
-    """Show what was found while a map was made: its results have no images."""
+    """Show the check in the report.json of a map, and return the exit code; nothing is checked again."""
     report = read_document(file, "a report of a map", hint="check the recording itself")
     document = report.get("check") if isinstance(report, dict) else None
     if not isinstance(document, dict):
@@ -131,7 +135,10 @@ def _lines_of_results(document: Mapping[str, Any], file: Path) -> list[str]:
 def _checked(
     request: CheckDriveRequest, settings: PlatformSettings
 ) -> tuple[CheckReport, Intrinsics, tuple[str, ...]]:
-    """Track the source, and return what is wrong with it, its intrinsics, and the lines that were shown."""
+    """Track the source; return the result of its check, its intrinsics, and the printed lines about doubts.
+
+    A path that is no recording and no bag is opened as a camera, a video or a folder of images.
+    """
     from client_sdk.bags import is_bag
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.open_camera import is_recording
@@ -183,14 +190,17 @@ def _checked(
 def _compared(
     log: DoubtLog, reference: MotionReference | None, span_s: tuple[float, float] | None
 ) -> DoubtLog:
-    """Return the log, with a doubt if the odometry has no time stamp within the recording."""
+    """Add a doubt to *log* if *reference* has no time stamp within the recording; return *log*."""
     if reference is not None:
         log.add_reference(f"the {reference.name}", reference.path.timestamps_s, span_s)
     return log
 
 
 def _reference(request: CheckDriveRequest, truth: MotionReference | None) -> MotionReference | None:
-    """Return what the user names, else the truth, else the odometry in the folder."""
+    """Return the path with which the motion is compared: the file of the user, the truth, or odometry.txt.
+
+    The first of these that exists is returned; None without one.
+    """
     from client_sdk.check.motion import MotionReference
 
     if request.odometry is not None:
@@ -209,9 +219,10 @@ def _watched(
     has_depth: bool,
     most: int | None,
 ) -> CheckReport:
-    """Track all frames in this process, and return what is wrong with them.
+    """Track the frames in this process, at most *most* of them (None for all), and return their check.
 
-    A source that fails ends the drive; what was seen before is checked.
+    If the source fails after its first frame, the frames before are checked.  *accepted* are the names of the
+    doubts that the user has accepted.
     """
     from client_sdk.check.observer import DriveObserver
     from client_sdk.mapper import Mapper
@@ -238,7 +249,10 @@ def _watched(
 
 
 def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:
-    """Yield frames; an error after the first one ends them, and is a doubt about the source."""
+    """Yield *frames* until the source fails; add the failure to *log* as a doubt.
+
+    An error before the first frame is raised.
+    """
     count = 0
     try:
         for frame in frames:
@@ -251,7 +265,10 @@ def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:
 
 
 def _base(request: CheckDriveRequest, seen: Intrinsics) -> Intrinsics:
-    """Return the intrinsics that corrections apply to: those of the user or the folder, else *seen*."""
+    """Return the intrinsics to correct: those of ``--intrinsics``, else of the folder's file, else *seen*.
+
+    A file of a rig is not corrected; *seen* is returned then, too.
+    """
     from client_sdk.rigs.intrinsics import Intrinsics
     from client_sdk.rigs.rig_file import read_calibration
 
@@ -262,7 +279,10 @@ def _base(request: CheckDriveRequest, seen: Intrinsics) -> Intrinsics:
 
 
 def _write(file: Path, report: CheckReport, own: Intrinsics) -> list[str]:
-    """Write the intrinsics with what is certain, and return what was changed."""
+    """Write *own* with the corrections of certain findings to *file*, and return a line for the user.
+
+    Nothing is written if no finding changes the intrinsics.
+    """
     from client_sdk.check.corrections import corrected
     from client_sdk.rigs.intrinsics import write_intrinsics
 

@@ -26,10 +26,11 @@ from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 
 __all__ = ["ExportRequest", "run_export"]
 
-_FOLDER_NAMES = ("colmap", "nerfstudio", "occupancy")
+_FOLDER_NAMES = ("colmap", "nerfstudio", "occupancy")  # names of the formats that are a folder of files
 _BAG_FORMAT = "mcap"  # the name of the format of bags that ROS 2 and Foxglove read
 _GRID_OPTIONS = ("resolution", "robot_height", "step", "floor", "up")
 """Names of the options that belong to the format occupancy alone."""
+# Note for the user if the store has no images of the map's keyframes.
 _NO_IMAGES = (
     "this map names no images that are stored: set live.images for live maps, or name those of "
     "map from-camera --keep-images by --images"
@@ -39,8 +40,7 @@ _MAX_IMAGE_BYTES = 64 << 20  # largest size in bytes of an image file in the fol
 _Files = tuple[dict[str, bytes], list[str]]
 """The contents of the files of a folder by their names, and notes for the user about what is missing."""
 
-
-_GRID = GridOptions()
+_GRID = GridOptions()  # the default options of a floor plan, which the help texts state
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ def run_export(
 
     Args:
         request: The version, the format and its options.
-        settings: The store, unless the request names one.
+        settings: Settings that name the store of maps, unless the request names one.
         write_bag: Writes the map to a file as an MCAP bag and returns the size of the file in bytes.
 
     Raises:
