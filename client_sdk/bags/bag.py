@@ -71,9 +71,12 @@ _USUAL_DEPTH_SCALE = 1000.0  # units per metre of 16-bit depth if nothing is sta
 _MAX_VIEW_DIFFERENCE = 0.01
 # Largest number of changes of the stated camera that are compared with images; an autofocus causes many.
 _MAX_CHECKED_CHANGES = 5
-# A change of the camera is contradicted if its error in the images exceeds that of no change by this many px,
+# Smallest difference of the errors in the images, px, with a stated change of the camera and without it, at
+# which the images contradict the change.
 _MIN_MISMATCH_PX = 3.0
-_MIN_MISMATCH_RATIO = 2.0  # and is also above this many times the error of no change
+# Smallest ratio of the errors in the images, with a stated change of the camera and without it, at which the
+# images contradict the change.
+_MIN_MISMATCH_RATIO = 2.0
 _ESTIMATED_FRAMES = {"odom", "map"}
 """Root frames of tf whose poses come from an odometry or another SLAM system, and are no ground truth."""
 
@@ -525,7 +528,10 @@ def _rectification(
     if options.rig is not None:
         left, right = options.rig.left, options.rig.right
         if right is None:
-            raise UsageError("the rig has one camera", hint="give a rig of two, or take one: --no-depth")
+            raise UsageError(
+                "the rig has one camera, and a stereo pair needs two",
+                hint="give a rig of two cameras, or use one: --no-depth",
+            )
         _check_size(chosen.colour.name, formats, "the rig", left.lens.camera)
         _check_size(chosen.right.name, formats, "the rig", right.lens.camera)
     else:

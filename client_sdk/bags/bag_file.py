@@ -191,7 +191,7 @@ def _all_faults() -> tuple[type[Exception], ...]:
     from apsw import Error
     from rosbags.rosbag1 import ReaderError as ReaderError1
     from rosbags.rosbag2 import ReaderError as ReaderError2
-    from rosbags.rosbag2.reader import zstd  # type: ignore[attr-defined]  # the one it reads with
+    from rosbags.rosbag2.reader import zstd  # type: ignore[attr-defined]  # the module with which it decompresses
     from rosbags.serde import SerdeError
     from rosbags.typesys import TypesysError
 

@@ -121,10 +121,12 @@ def choose_topics(
             hint="name both: --colour TOPIC of the left one, --right TOPIC",
         )
     if pair is not None and depth is not None:
-        raise UsageError(f"{depth} and a right camera are not used together", hint="leave out one of both")
+        raise UsageError(
+            f"{depth} and a right camera are not used together", hint="leave out --depth or --right"
+        )
     if pair is None:
         of_colour, of_right = _choose(topics, images, formats, "colour", colour, None), None
-        if colour is None:  # of a pair, the left one
+        if colour is None:  # if the chosen topic is the right camera of a pair, use the left one
             lefts = {other.name: one for one, other in _side_pairs(images, formats)}
             of_colour = lefts.get(of_colour.name, of_colour)
     else:
@@ -225,7 +227,7 @@ def _choose_pair(
                 )
             left = partners[0].name
         if left == right:
-            raise UsageError(f"{left} is both cameras of the pair", hint="name two topics")
+            raise UsageError(f"{left} is named as the left and the right camera", hint="name two topics")
         return _choose(topics, images, formats, "colour", left, None), of_right
     if left is not None:
         return next((pair for pair in pairs if pair[0].name == left), None)

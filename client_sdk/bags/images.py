@@ -187,7 +187,8 @@ def _rows(message: Any) -> npt.NDArray[np.uint8]:
     used, height, step = message.width * bytes_per_px, message.height, message.step
     if not used or not height or step < used or len(message.data) < step * height:
         raise BrokenMessage(
-            f"an image of {message.width}x{height} px has {len(message.data)} bytes in rows of {step}"
+            f"an image of {message.width}x{height} px has {len(message.data)} bytes in rows of {step} bytes: "
+            "not enough for the image"
         )
     rows: npt.NDArray[np.uint8] = message.data[: step * height].reshape(height, step)
     return rows if step == used else np.ascontiguousarray(rows[:, :used])

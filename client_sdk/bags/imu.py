@@ -131,7 +131,9 @@ def imu_track(
         raise UsageError(f"no sample of {topic} lies between the first and the last frame", hint=_HINT)
     most = int(np.diff(within).max())
     if most > MAX_SAMPLES // 2:
-        raise UsageError(f"{topic} has {most} samples between two frames", hint=_HINT)
+        raise UsageError(
+            f"{topic} has {most} samples between two frames, more than {MAX_SAMPLES // 2}", hint=_HINT
+        )
     noise, whose = _noise(topic, stamps_s, mount.T_left_imu, rig)
     T_body_left = np.eye(4) if rig is None else rig.left.T_body_camera
     model = noise.model(T_body_left @ mount.T_left_camera)
@@ -148,7 +150,8 @@ def _noise(topic: str, stamps_s: Array, T_left_imu: Array | None, rig: Rig | Non
         return rig.imu, "as the file of intrinsics states it"
     if T_left_imu is None:
         raise UsageError(
-            f"no tf_static joins the frame of {topic} with that of the camera: its place is not known",
+            f"no tf_static joins the frame of {topic} with that of the camera: the pose of the IMU is "
+            "not known",
             hint=_HINT,
         )
     T_body_left = np.eye(4) if rig is None else rig.left.T_body_camera

@@ -28,9 +28,8 @@ def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:
         return None
     sensor = stream.rpartition("/")[0]
     message = _first(file, f"{sensor}/option/Depth_Units", FLOAT)
-    unit_m = (
-        0.0 if message is None else round(float(message.data), 9)
-    )  # a float of 32 bits has no more digits
+    # The message has a 32-bit float: 0.001 is read as 0.0010000000475, and rounded.
+    unit_m = 0.0 if message is None else round(float(message.data), 9)
     return unit_m if math.isfinite(unit_m) and unit_m > 0.0 else None
 
 

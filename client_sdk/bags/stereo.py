@@ -52,7 +52,7 @@ def pair_of(
     elif T_left_right is None:
         raise UsageError(
             f"{right[0]} states a baseline of 0 (P[3]), and no tf_static joins the frames of both cameras: "
-            "where the right camera sits is not known",
+            "the pose of the right camera is not known",
             hint=_HINT,
         )
     distance_m = float(np.linalg.norm(T_left_right[:3, 3]))

@@ -58,7 +58,8 @@ class ImageStream:
                 self._seek(start_ns)
                 if not self._read(missing, until_ns=None):
                     raise UsageError(
-                        f"{self._file.path} does not hold its messages any more", hint="read it again"
+                        f"{self._file.path} lacks messages that it held before",
+                        hint="do not change a bag while it is read",
                     )
         taken = [self._waiting[image] for image in wanted]
         oldest = min(stamp for _, stamp, _ in wanted)

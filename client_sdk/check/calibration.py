@@ -59,7 +59,8 @@ _MIN_PART_SHARE = 0.7
 _MIN_CORRELATION = 0.8  # absolute correlation from which two errors of the calibration count as confused
 # Smallest motion of the camera, as a share of the distance of the scene, that determines a calibration.
 _MIN_MOVED_SHARE = 0.01
-_MIN_MOVED_SHARE_FOR_OFFSET = 0.06  # smallest such share that determines an offset of depths
+# Smallest motion of the camera, as a share of the distance of the scene, that determines an offset of depths.
+_MIN_MOVED_SHARE_FOR_OFFSET = 0.06
 _MAX_DEPTH_FACTOR = 2.0  # `Calibrated.depth_factor` above which depth noise is named as the reason
 _MIN_DEPTH_SHARE = 0.2  # share of features with a depth below which missing depths are named as the reason
 # Indices of the unknowns that belong to each fault.

@@ -41,7 +41,7 @@ _MAX_COST = 6.0
 """Largest cost of one observation in the score of a reading, and the cost of each observation of a keyframe
 whose pose was not found.  Costs have no unit."""
 _SCORE_SCALE_PX = 3.0  # reprojection error, pixels, that counts as 1 before the logarithm of the score
-_SCORE_SCALE_SIGMAS = 4.0  # error of a depth, in standard deviations, that counts as 1
+_SCORE_SCALE_SIGMAS = 4.0  # error of a depth, in standard deviations, that counts as 1 in the score
 _DELAYS_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)  # delays of the depth images that are tried
 _MAX_COST_RATIO = 0.9
 """A flip or a delay of the depth images is accepted if its score is below this share of the score of the

@@ -15,7 +15,7 @@ __all__ = ["CannotTell", "CheckReport", "FaultKind", "Finding", "matters", "orde
 
 _CERTAIN_SIGMAS = 3.0  # a finding is certain if its value exceeds this many of its standard deviations
 _MIN_COST_M = 0.002  # a fault matters only if it bends the path by more than this, in metres
-_MIN_COST_NOISES = 1.2  # and by more than this many times the uncertainty of the path
+_MIN_COST_NOISES = 1.2  # a fault matters only if it bends the path by this many times its uncertainty
 
 
 class FaultKind(str, Enum):
@@ -71,9 +71,9 @@ class Finding:
     """One fault of a drive.
 
     Attributes:
-        kind: What is wrong.
-        value: Size of the fault in *unit*, see `FaultKind`.  For a relative error, +0.1 means that a setting
-            is 10 % too large, and 4.0 that it is five times what it should be.
+        kind: Kind of the fault.        value: Size of the fault in *unit*, see `FaultKind`.  For a relative
+            error, +0.1 means that a setting is 10 % too large, and 4.0 that it is five times what it should
+            be.
         deviation: Standard deviation of *value*, in *unit*; 0 if the value was counted or needs none.
         unit: ``relative``, ``share``, ``px``, ``m``, ``s`` or empty.
         cost_m: How far the fault bends the trajectory, metres; None if unknown.

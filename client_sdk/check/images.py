@@ -43,8 +43,8 @@ _MIN_FAULTY_FRAMES = 3  # smallest number of faulty frames, or of gaps, that is 
 # stationary camera, images change less.
 _MIN_CHANGE_RATIO = 0.3
 _MAX_REPEATED_RUN = 10  # largest number of repeated images in a row; a longer run may be a stationary camera
-# A longer run of equal images is a fault if the next change exceeds this many times the median change: a
-# camera that starts to move changes the image less.
+# More than 10 equal images in a row are a fault if the next change of the image exceeds this many times the
+# median change: a camera that starts to move changes the image less.
 _MIN_FROZEN_JUMP = 1.7
 # A cause of loss is named only if more than this share of the lost frames are dark, plain or blurred.
 _MIN_COMMON_CAUSE_SHARE = 0.5
@@ -281,7 +281,7 @@ def sharpness(gray: _Image) -> tuple[float, float]:
     result is the median of the edges; NaN in a direction with fewer than 40 edges.
     """
     rows, columns = (max(1, side // _SAMPLED_LINES) for side in gray.shape)
-    # Copied row by row, as the image lies in memory, before its columns become lines.
+    # Copy the sampled columns row by row, in the order of memory, before they are transposed to lines.
     upright = np.ascontiguousarray(gray[:, ::columns]).T
     return _edges(np.ascontiguousarray(gray[::rows])), _edges(np.ascontiguousarray(upright))
 

@@ -192,7 +192,7 @@ def _described(frame: Frame, found: Features | None) -> DescribedKeypoints | Fea
         return describe(frame.rgb, _EXTRACTED_FEATURES)
     if len(found.pixels) <= _MAX_FEATURES:
         return found
-    # Keep the features of the finest scales: the next image keeps the same ones, so that they still match.
+    # Keep the features of the finest scales, since the next image keeps the same ones, and they match.
     rows = np.sort(np.argsort(found.sizes, kind="stable")[:_MAX_FEATURES])
     return replace(
         found, pixels=found.pixels[rows], descriptors=found.descriptors[rows],

@@ -62,13 +62,15 @@ motions' sum of squares."""
 _MIN_AXES_ANGLE_DEG = 20.0  # smallest rotation between the axes of reference and camera that is a fault
 # Largest rotation, degrees, from an exchange of axes at which a message names the exchanged axes.
 _MAX_NAMED_AXES_ERROR_DEG = 15.0
-_SEGMENT_M = 0.25  # shortest distance, metres, that the reference moves in a part whose scale is compared
-_SEGMENT_S = 6.0  # longest time of such a part, seconds: longer ones have drift
-_MIN_SEGMENTS = 12  # fewest such parts from which a scale is computed
+_SEGMENT_M = 0.25  # distance, metres, that the reference moves in each part of a path whose scale is compared
+_SEGMENT_S = 6.0  # longest time, seconds, of a part of a path whose scale is compared: longer ones have drift
+_MIN_SEGMENTS = 12  # fewest parts of a path from whose lengths the scale is computed
 MIN_ADJUSTED_KEYFRAMES = 16
 """Fewest adjusted keyframes from which the scale is computed; with fewer ones the tracked poses are used."""
 _ARM_M = 0.5  # typical distance, metres, of a camera from the frame of an odometry: a prior
-_CAMERA_ARM_M = 0.02  # the same if the poses of the reference are those of the camera itself
+# Typical distance, metres, between the camera and a reference that has the poses of the camera itself: a
+# prior.
+_CAMERA_ARM_M = 0.02
 _MIN_SCALE_ERROR = 0.01  # smallest relative error of the scale that is reported
 _MAX_RESIDUAL_RATIO = 4.0  # a residual above this many times the median one is an outlier
 
@@ -130,7 +132,7 @@ def read_odometry(file: Path) -> Trajectory:
     """
     path = read_trajectory(file)
     if len(path) < 2:
-        raise UsageError(f"{file} holds {len(path)} poses", hint="a motion needs 2 or more")
+        raise UsageError(f"{file} holds {len(path)} poses", hint="give a path of 2 poses or more")
     return Trajectory(stamps_in_seconds(path.timestamps_s, str(file))[0], path.T_world_camera)
 
 
@@ -209,7 +211,7 @@ def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list
     )
     pairs = pairs[covered]
     if len(pairs) < _MIN_PAIRS:
-        reason = f"{reference.name} and camera have {len(pairs)} motions in common"
+        reason = f"{reference.name} and camera have {len(pairs)} motions in common, fewer than {_MIN_PAIRS}"
         return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.MIRRORED, reason)]
     seen = _twists(T_world_camera[pairs[:, 0]], T_world_camera[pairs[:, 1]], *stamps_s[pairs.T])
     fits = _fits(seen, stamps_s[pairs], reference)

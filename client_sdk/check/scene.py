@@ -182,7 +182,7 @@ def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
         return ()
     rays, depths = ratios
     slope, weights = 0.0, np.ones(len(rays))
-    for _ in range(8):  # of least squares with the weights of a Cauchy loss
+    for _ in range(8):  # iterations of least squares, reweighted by a Cauchy loss
         slope = float((weights * rays * depths).sum() / max(1e-9, (weights * rays * rays).sum()))
         errors = depths - slope * rays
         spread = 1.4826 * float(np.median(np.abs(errors))) + 1e-6

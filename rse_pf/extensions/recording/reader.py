@@ -227,7 +227,7 @@ class WireRecording:
                 continue
             if found is not None:
                 raise BadRequest(
-                    f"several commands are called {identity[:40]!r}",
+                    f"several commands have the id {identity[:40]!r}",
                     hint=f"give the connection, too: {found.id} or {command.id}",
                 )
             found = command
@@ -382,7 +382,7 @@ def recording_files(path: Path) -> tuple[Path, ...]:
         return files
     if not path.exists():
         raise UsageError(f"there is no file {path}", hint="give a file or a folder of rse-pf local --record")
-    if not path.is_file():  # nobody waits for what a pipe brings
+    if not path.is_file():  # reading a pipe or a device could block forever
         raise _no_recording(path)
     with path.open("rb") as file:
         start = file.read(len(_MAGIC))
@@ -597,7 +597,7 @@ def _decompress(chunk: Any) -> bytes:
     size: int = chunk.uncompressed_size
     if size > _MAX_CHUNK_BYTES:
         raise LimitExceeded(
-            f"a chunk of {size} bytes is above {_MAX_CHUNK_BYTES}", hint="this is no recording of rse-pf"
+            f"a chunk of {size} bytes is above {_MAX_CHUNK_BYTES}", hint="give a file that rse-pf recorded"
         )
     data: bytes = chunk.data
     if chunk.compression == "lz4":

@@ -110,7 +110,7 @@ class FileServerRecorder:
             return NullMessageTap()
 
         def renew() -> int | None:
-            log.error("recorder-lost", hint="a new one is started; restart the server if none is")
+            log.error("recorder-lost", hint="a new recorder is started; if none starts, restart the server")
             return send_pipe(to_recorder)
 
         return RecordingTap(
@@ -166,12 +166,12 @@ class FileServerRecorder:
                 _log(self._server, "recorder-given-up", str(error), len(ends))
                 break
             self.pids[:] = [process.pid]
-            _log(self._server, "recorder-restarted", "see why it ended", len(ends))
+            _log(self._server, "recorder-restarted", "look for the error of the recorder above", len(ends))
         else:
             return
         self.pids.clear()
         if self._from_workers is not None:
-            self._from_workers.close()  # so that workers see that there will be no recorder
+            self._from_workers.close()  # workers notice by it that there will be no recorder
 
 
 def _log(server: str, event: str, hint: str, ends: int) -> None:

@@ -222,7 +222,7 @@ class RecordingWriter:
             raise OSError(0, self.problem)
         self._number += 1
         path = self._folder / str(FileName(self._started, self._server, self._number))
-        while path.exists():  # of a recorder that started in the same second
+        while path.exists():  # another recorder of this server, started in the same second, wrote that file
             self._number += 1
             path = self._folder / str(FileName(self._started, self._server, self._number))
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
@@ -254,7 +254,7 @@ class RecordingWriter:
         self._numbers.clear()
         self._path = None
         if self._fd >= 0:
-            with suppress(OSError):  # of a disk that is gone
+            with suppress(OSError):  # closing fails if the disk was removed
                 os.close(self._fd)
             self._fd = -1
 

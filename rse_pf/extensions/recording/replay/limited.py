@@ -137,7 +137,7 @@ class LimitedReplay:
                 f"{path} cannot be read within limits: {crash.message}", hint="do not trust this file"
             ) from None
         except msgspec.DecodeError as error:
-            raise InternalError("the process with limits replied with something else") from error
+            raise InternalError("the process with limits returned a result of another type") from error
 
 
 def replayer(configuration: str) -> Handler:

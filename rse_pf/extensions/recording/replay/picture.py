@@ -73,7 +73,9 @@ def match_picture(
         is_near, projected = _project_near(points_world[shown], T_camera_world, camera)
         drawn = shown[is_near]
         _draw_lines(draw, pixels[drawn] * scale, projected[is_near] * scale, agrees[drawn])
-    for row in shown[np.argsort(agrees[shown], kind="stable")]:  # inliers on top
+    for row in shown[
+        np.argsort(agrees[shown], kind="stable")
+    ]:  # outliers first, so that inliers are drawn over them
         u, v = pixels[row] * scale
         if agrees[row]:
             draw.ellipse((u - 4, v - 4, u + 4, v + 4), fill=INLIER, outline=_WHITE)
@@ -112,7 +114,9 @@ def _decode(thumbnail: bytes) -> Any:
     try:
         image = image_module.open(io.BytesIO(thumbnail), formats=("JPEG",))
         if image.width * image.height > MAX_THUMBNAIL_PX:
-            raise BadRequest("a thumbnail is too large", hint="record smaller ones")
+            raise BadRequest(
+                f"a thumbnail of {image.width}x{image.height} px is too large", hint="record smaller ones"
+            )
         image.load()
     except (OSError, ValueError, SyntaxError, EOFError, image_module.DecompressionBombError) as error:
         raise BadRequest("a thumbnail is no JPEG", hint="leave it out") from error
