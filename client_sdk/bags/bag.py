@@ -98,7 +98,7 @@ class BagOptions:
             depth and 1 for floats.
         pair_within_s: Largest difference of the time stamps, seconds, of the colour and the depth image of a
             frame, or of its left and right image.
-        use_depth: False uses neither depth nor a stereo pair, unless *right* is named.
+        use_depth: False uses neither depth nor a stereo pair, unless *right* or *use_stereo* asks for a pair.
         use_stereo: True uses a stereo pair even if there is depth; False uses only the left camera of a pair;
             None uses a pair if there is no depth.
         use_imu: None uses the IMU if it can be used; True refuses a bag without a usable IMU; False uses

@@ -166,7 +166,7 @@ class BagFile(AutoClose):
 
 
 def _only_bag_of(folder: Path) -> Path | None:
-    """Return the one bag file of a folder without ``metadata.yaml``; None if there are none or several."""
+    """Return the only file in a folder with the ending of a bag; None if there is none, or several."""
     bag_paths = [path for path in folder.iterdir() if path.suffix in _ENDINGS and path.is_file()]
     return bag_paths[0] if len(bag_paths) == 1 else None
 

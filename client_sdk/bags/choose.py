@@ -102,7 +102,7 @@ def choose_topics(
         info: Topic of the ``CameraInfo`` of *colour* that the user named.
         poses: Topic of the poses that the user named.
         imu: Topic of the IMU that the user named.
-        use_depth: False uses neither depth nor a stereo pair, unless *right* is named.
+        use_depth: False uses neither depth nor a stereo pair, unless *right* or *use_stereo* asks for a pair.
         use_stereo: True uses a stereo pair even if there is depth; False uses only the left camera of a pair;
             None uses a pair if there is no depth.
         use_imu: Whether to use an IMU.

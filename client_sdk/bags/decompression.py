@@ -34,7 +34,7 @@ class Allowance:
             raise ValueError("it decompresses to far more than it has bytes")
 
 
-_charged = Allowance(0)
+_charged = Allowance(0)  # the allowance from which decompressed bytes are subtracted at present
 
 
 def charge(allowance: Allowance) -> None:
@@ -101,6 +101,6 @@ class _CountedFile(io.RawIOBase):
         return data
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the compressed file."""
         self._content.close()
         super().close()

@@ -127,7 +127,7 @@ class MessageMaker:
         return self.make(PATH, header=self.header(stamp_ns, frame), poses=poses)
 
     def transform(self, stamp_ns: int, frame: str, child: str, T: Array) -> Any:
-        """Return a ``TransformStamped``: *T* ``(4, 4)`` is the pose of *child* in *frame*."""
+        """Return a ``TransformStamped``; *T* ``(4, 4)``, metres, is the pose of *child* in *frame*."""
         moved = self.make(
             "geometry_msgs/msg/Transform",
             translation=self._numbers("Vector3", T[:3, 3], "xyz"),
@@ -145,7 +145,7 @@ class MessageMaker:
         return self.make(TF, transforms=moved)
 
     def imu(self, stamp_ns: int, frame: str, gyro: Array, accel: Array) -> Any:
-        """Return an ``Imu`` without orientation: ``(3,)`` rad/s and ``(3,)`` m/s^2 in the axes of *frame*."""
+        """Return an ``Imu`` without orientation; *gyro* ``(3,)`` is in rad/s, *accel* ``(3,)`` in m/s^2."""
         none = np.zeros(9)
         none[0] = -1.0  # by the definition of Imu, -1 means that there is no orientation
         return self.make(

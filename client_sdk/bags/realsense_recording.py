@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, from_quaternion, inverse
 
 __all__ = ["stated_T_colour_depth", "stated_depth_unit_m"]
 
-_IMAGES = "/image/data"
+_IMAGES = "/image/data"  # ending of the topics of images
 
 
 def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:

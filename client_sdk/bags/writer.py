@@ -54,7 +54,7 @@ class BagWriter(MessageMaker, AutoClose):
         return self
 
     def close(self) -> None:
-        """Finish the bag."""
+        """Write the index of the bag, and close its files."""
         self._writer.close()
 
     def write(self, topic: str, kind: str, log_ns: int, message: Any) -> None:

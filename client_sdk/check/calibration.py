@@ -29,7 +29,8 @@ from rse_pf.slam.self_calibration import (
 
 __all__ = ["CalibrationCheck", "check_calibration"]
 
-_FX, _FY, _CX, _CY, _K1, _OFFSET, _DELAY = range(7)
+_FX, _FY, _CX, _CY, _K1, _OFFSET, _DELAY = range(7)  # indices of the first seven `UNKNOWNS`
+# Errors of the calibration that are estimated for a drive without depth images.
 _COLOUR_UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "readout")
 # Fewest keyframes, and fewest poses of a camera without depth, with which a calibration is checked.
 _MIN_KEYFRAMES = 6
@@ -68,6 +69,7 @@ _ROWS = {
     FaultKind.FOCAL_LENGTH: (_FX, _FY), FaultKind.PRINCIPAL_POINT: (_CX, _CY),
     FaultKind.DISTORTION: (_K1,), FaultKind.DEPTH_OFFSET: (_OFFSET,), FaultKind.DEPTH_DELAY: (_DELAY,),
 }  # fmt: skip
+# Faults of the colour camera, which are checked in every drive.
 _COLOUR_FAULTS = (FaultKind.FOCAL_LENGTH, FaultKind.PRINCIPAL_POINT, FaultKind.DISTORTION)
 _UNITS = ("%", "%", "px", "px", "", "cm", "s")  # in which messages state the first seven unknowns
 _UNIT_FACTORS = (100.0, 100.0, 1.0, 1.0, 1.0, 100.0, 1.0)  # from the unit of an unknown to `_UNITS`

@@ -11,8 +11,8 @@ from rse_pf.geometry import Camera
 
 __all__ = ["corrected"]
 
-_CAMERA = ("fx", "fy", "cx", "cy")
-_LENS = ("k1", "k2", "p1", "p2", "k3")
+_CAMERA = ("fx", "fy", "cx", "cy")  # corrections of the pinhole camera, px
+_LENS = ("k1", "k2", "p1", "p2", "k3")  # corrections of the distortion, in the order of its coefficients
 
 
 def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intrinsics, tuple[str, ...]]:

@@ -81,6 +81,7 @@ _H5PY_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, Overflow
 """Errors that h5py raises for a damaged file; each becomes a UsageError."""
 _SHAPES = {"images": (3, *_SIZE_PX), "depths": _SIZE_PX, "rawDepths": _SIZE_PX}
 """Shape of one image in each array of the labelled file: (channels,) columns, rows."""
+# Name of an image of a raw dump, with its time stamp in seconds.
 _RAW_FILE_NAME = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
 
 

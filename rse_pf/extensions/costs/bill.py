@@ -54,13 +54,13 @@ NOT_INCLUDED = (
     "live maps (0.04 USD an hour each, in S3), savings plans, the free tier"
 )
 
-_HOUR_S = 3600.0
-# A capacity unit of the load balancer holds this many open connections, or passes this many bytes in an hour.
+_HOUR_S = 3600.0  # seconds of an hour# Number of open connections that one capacity unit of the load balancer pays for.
 _CONNECTIONS_OF_A_UNIT = 3000
+# Number of bytes per hour that one capacity unit of the load balancer pays for.
 _BYTES_OF_A_UNIT = 1e9
-# The load balancer needs a public address in each of two zones.
+# Number of zones of the load balancer, in each of which it needs a public address.
 _BALANCER_ZONES = 2
-# Metrics that EC2 publishes each minute for a server with detailed monitoring.
+# Number of metrics that EC2 publishes each minute for a server with detailed monitoring.
 _DETAILED_METRICS = 7
 # Number of metrics that the agent of a server with robots reads in each period: robots, and servers.
 _READ_METRICS = 2

@@ -31,20 +31,19 @@ FORMAT_VERSION: Final = 1
 """Version of the format that this module describes; a reader rejects files with a higher one."""
 METADATA_NAME: Final = "rse_pf"
 """Name of the metadata record at the start of every file; its values are strings."""
-SUFFIX: Final = ".mcap"
+SUFFIX: Final = ".mcap"  # ending of the names of files
 
 WIRE_ENCODING: Final = "rse-pf-wire"
 """Message encoding of the channels that hold the bytes of WebSocket messages as they were sent."""
 JSON_ENCODING: Final = "json"
 JSON_SCHEMA_ENCODING: Final = "jsonschema"
 
-EVENTS_TOPIC: Final = "/platform/events"
-SAMPLES_TOPIC: Final = "/platform/samples"
-POSES_PREFIX: Final = "/poses/"
-FRAMES_PREFIX: Final = "/frames/"
-ODOMETRY_PREFIX: Final = "/odometry/"
-MAP_TOPIC: Final = "/map"
-
+EVENTS_TOPIC: Final = "/platform/events"  # events of the platform, and of the recorder itself
+SAMPLES_TOPIC: Final = "/platform/samples"  # samples of the platform's monitor
+POSES_PREFIX: Final = "/poses/"  # poses in the answers to a robot, whose pseudonym follows
+FRAMES_PREFIX: Final = "/frames/"  # thumbnails of a robot's frames; its pseudonym follows
+ODOMETRY_PREFIX: Final = "/odometry/"  # odometry poses of a robot's frames; its pseudonym follows
+MAP_TOPIC: Final = "/map"  # points of the maps of a robot
 EVENT_SCHEMA: Final = "rse_pf.Event"
 SAMPLE_SCHEMA: Final = "rse_pf.Sample"
 ODOMETRY_SCHEMA: Final = "rse_pf.Odometry"
@@ -55,8 +54,8 @@ IMAGE_SCHEMA: Final = "foxglove.CompressedImage"
 Direction = Literal["up", "down"]
 """Direction of a message: ``up`` from the robot to the server, ``down`` from the server to the robot."""
 
-_WIRE_TOPIC = re.compile(r"/wire/([0-9a-f]{16})/(up|down)")
-_FILE_NAME = re.compile(r"(\d{8}T\d{6}Z)-(.+)-(\d{4,})")
+_WIRE_TOPIC = re.compile(r"/wire/([0-9a-f]{16})/(up|down)")  # connection and direction
+_FILE_NAME = re.compile(r"(\d{8}T\d{6}Z)-(.+)-(\d{4,})")  # start, server and number, without the suffix
 _NOT_FOR_A_FILE = re.compile(r"[^A-Za-z0-9_.-]")  # characters of a server's name that a file name replaces
 _MAX_SERVER_LETTERS = 64  # largest number of characters of a server's name in a file name
 _TIME_FORMAT = "%Y%m%dT%H%M%SZ"  # the start of the recorder in a file name, UTC
@@ -135,7 +134,7 @@ def wire_channel(topic: str, metadata: dict[str, str]) -> WireChannel | None:
 
 
 def _schema(title: str, **properties: Any) -> bytes:
-    """Return a JSON schema of an object."""
+    """Return the encoded JSON schema of an object with these properties."""
     return json.dumps({"title": title, "type": "object", "properties": properties}).encode()
 
 

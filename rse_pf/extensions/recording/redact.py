@@ -50,6 +50,7 @@ _TOKEN = re.compile(rb"eyJ[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,
 """Pattern of a JSON Web Token; a message that contains one is left out."""
 _RESULT = re.compile(rb'\{"type":"result","id":([1-9][0-9]{0,15}|0),"reply":')
 """Start of a result in JSON as servers write it, with the id of the command: saves decoding the message."""
+# Exceptions of a message that cannot be decoded, which is then left out.
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, RsePfError)
 
 

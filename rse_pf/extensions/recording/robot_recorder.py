@@ -1,7 +1,7 @@
 """Record a robot: its messages, thumbnails of its frames, its odometry, and the points of its maps.
 
 The robot puts entries into a bounded queue, and a thread writes them into a folder.  Entries that do not fit
-are dropped and counted, so a slow or full disk costs the recording and never a pose.
+are dropped and counted, so that a slow or full disk never delays the robot.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class RobotRecorder:
         self._frames = 0
 
     def start(self) -> None:
-        """Begin to record.
+        """Create the folder, and start the thread that writes the files.
 
         Raises:
             MissingExtra: The package mcap, or Pillow for thumbnails, is not installed.
@@ -303,7 +303,7 @@ def _subsample(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def _encode_thumbnail(rgb: npt.NDArray[np.uint8]) -> bytes:
-    """Return *rgb* as a JPEG of at most `THUMBNAIL_WIDTH_PX`."""
+    """Return *rgb* as a JPEG that is at most `THUMBNAIL_WIDTH_PX` wide."""
     from PIL import Image
 
     picture = Image.fromarray(rgb)

@@ -78,7 +78,7 @@ class FileServerRecorder:
         self._is_over = threading.Event()
 
     def __enter__(self) -> FileServerRecorder:
-        """Start the recorder process."""
+        """Start the recorder process, and prepare the thread that restarts it; the thread starts later."""
         recording = self._settings.recording
         self._from_workers, self._to_recorder = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._to_recorder.setblocking(False)

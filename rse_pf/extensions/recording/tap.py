@@ -92,7 +92,10 @@ def send_pipe(to_recorder: int) -> int | None:
 
 
 class RecordingTap:
-    """Pass the messages of connections to the recorder; a `rse_pf.server.worker_context.MessageTap`."""
+    """Pass the messages of a worker's connections to the recorder process.
+
+    Implements `rse_pf.server.worker_context.MessageTap`.
+    """
 
     __slots__ = (
         "_call_later",

@@ -38,6 +38,7 @@ _SHOWN = 20  # largest number of troubles, and of changed answers, that are prin
 _IN_PAGE = 5  # number of the worst commands whose reports are in the HTML file
 _LISTED_IN_JSON = 500  # largest number of troubles in JSON
 _ENGINES = ("native", "opencv")
+# Pattern of the id of a command: ``CONNECTION:ID`` or ``ID``.
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 

@@ -121,7 +121,7 @@ class LimitedReplay:
         return self._ask(task, str) or None
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process with limits."""
         self._processes.close()
 
     def _ask(self, task: _Task, kind: type[T]) -> T:

@@ -19,6 +19,7 @@ from rse_pf.terminal import counted, printable
 
 __all__ = ["html_page"]
 
+# Content security policy of the page: no scripts, and no requests.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 _GRID_COLUMNS = 8  # number of columns of the grid in which matches are counted, as in a `CommandReport`
 _BARS_WIDTH = 460  # width of a bar chart, CSS pixels

@@ -31,7 +31,7 @@ _MAX_TIME_S = 9e9  # largest Unix time, seconds, that nanoseconds of 63 bits can
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
-    """A command that was solved again with another answer."""
+    """A command whose new answer differs from the recorded one: its ``CONNECTION:ID``, and what differs."""
 
     id: str
     what: str
@@ -76,7 +76,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Worst:
-    """The *count* worst troubles."""
+    """Collects troubles, and keeps the worst *count* of them."""
 
     def __init__(self, count: int) -> None:
         self._count = count

@@ -36,7 +36,7 @@ __all__ = ["TIMES_AND_PLACES", "Again", "Overrides", "Resolver", "pnp_reply", "s
 TIMES_AND_PLACES = ("server", "queue_ms", "compute_ms", "received_s", "sent_s", "trace")
 """Fields of answers with times, server and trace, which are not compared: they differ each time."""
 _MAX_TRIED_ITERATIONS = 100_000  # as many as options can ask for; a server allows fewer
-_POSES_SERVICE = "pnp"
+_POSES_SERVICE = "pnp"  # name of the service that computes poses
 
 
 class Overrides(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -143,7 +143,12 @@ class Resolver:
         return Again(answer=answer, difference=difference_of(reply, answer) or "the bytes differ")
 
     def decoded(self, recorded: RecordedCommand) -> Command:
-        """Return the command as a server decodes it; raises BadMessage or LimitExceeded."""
+        """Decode a recorded command with the limits of the settings.
+
+        Raises:
+            BadMessage: The bytes are malformed, or not a command.
+            LimitExceeded: The message is larger than the limits allow.
+        """
         message = self._codec(recorded.codec).decode_from_robot(recorded.command_bytes)
         if not isinstance(message, Command):
             raise BadMessage("a recorded message is no command", hint="record again")

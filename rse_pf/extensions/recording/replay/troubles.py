@@ -26,6 +26,7 @@ KINDS = ("failed", "jump", "unanswered", "expired", "weak", "refused", "late")
 reached; no recorded answer; an answer that was no longer needed; a weak pose; a refusal before solving; an
 answer after the deadline."""
 
+# Codes of failures that mean that the answer was no longer needed, with the kind of trouble.
 _EXPIRED_CODES = {"expired": "expired", "stale": "expired", "cancelled": "expired"}
 # Fewest world points that two commands must have in common: fewer show that their world frames may differ.
 _MIN_COMMON_POINTS = 8
