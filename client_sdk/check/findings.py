@@ -71,9 +71,9 @@ class Finding:
     """One fault of a drive.
 
     Attributes:
-        kind: Kind of the fault.        value: Size of the fault in *unit*, see `FaultKind`.  For a relative
-            error, +0.1 means that a setting is 10 % too large, and 4.0 that it is five times what it should
-            be.
+        kind: Kind of the fault.
+        value: Size of the fault in *unit*, see `FaultKind`.  For a relative error, +0.1 means that a setting
+            is 10 % too large, and 4.0 that it is five times what it should be.
         deviation: Standard deviation of *value*, in *unit*; 0 if the value was counted or needs none.
         unit: ``relative``, ``share``, ``px``, ``m``, ``s`` or empty.
         cost_m: How far the fault bends the trajectory, metres; None if unknown.

@@ -54,7 +54,8 @@ NOT_INCLUDED = (
     "live maps (0.04 USD an hour each, in S3), savings plans, the free tier"
 )
 
-_HOUR_S = 3600.0  # seconds of an hour# Number of open connections that one capacity unit of the load balancer pays for.
+_HOUR_S = 3600.0  # seconds of an hour
+# Number of open connections that one capacity unit of the load balancer pays for.
 _CONNECTIONS_OF_A_UNIT = 3000
 # Number of bytes per hour that one capacity unit of the load balancer pays for.
 _BYTES_OF_A_UNIT = 1e9

@@ -44,6 +44,7 @@ POSES_PREFIX: Final = "/poses/"  # poses in the answers to a robot, whose pseudo
 FRAMES_PREFIX: Final = "/frames/"  # thumbnails of a robot's frames; its pseudonym follows
 ODOMETRY_PREFIX: Final = "/odometry/"  # odometry poses of a robot's frames; its pseudonym follows
 MAP_TOPIC: Final = "/map"  # points of the maps of a robot
+
 EVENT_SCHEMA: Final = "rse_pf.Event"
 SAMPLE_SCHEMA: Final = "rse_pf.Sample"
 ODOMETRY_SCHEMA: Final = "rse_pf.Odometry"
