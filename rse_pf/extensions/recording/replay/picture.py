@@ -17,9 +17,10 @@ from rse_pf.geometry import Array, Camera, transform
 
 __all__ = ["INLIER", "MAX_THUMBNAIL_PX", "OUTLIER", "match_picture"]
 
-INLIER, OUTLIER, REPROJECTED = (0, 114, 178), (213, 94, 0), (230, 159, 0)
-"""Colours (RGB) of inliers, of outliers, and of lines from outliers to their projections; colour-blind
-readers can distinguish them (Okabe and Ito 2008)."""
+# The colours (RGB) can be distinguished by colour-blind readers (Okabe and Ito 2008).
+INLIER = (0, 114, 178)  # colour of inliers, and of the lines to their projections: blue
+OUTLIER = (213, 94, 0)  # colour of outliers: vermilion
+REPROJECTED = (230, 159, 0)  # colour of the lines from outliers to the projections of their points: orange
 MAX_THUMBNAIL_PX = 1 << 20  # largest number of pixels of a thumbnail that is decoded
 _MAX_THUMBNAIL_BYTES = 1 << 20  # largest JPEG of a thumbnail that is opened
 _WIDTH_PX = 960  # width of the picture
