@@ -12,7 +12,7 @@ from rse_pf.geometry import Array, Lens
 __all__ = ["mismatch_px"]
 
 _FEATURES = 600  # number of features that are extracted from each image
-_MIN_MATCHES = 30  # fewest matches from which a lens is checked
+_MIN_MATCHES = 30  # fewest matches of two images from which a change of the lens is checked
 _ITERATIONS = 10  # iterations of the rotation fit, which is reweighted by a Cauchy loss
 
 _Image = npt.NDArray[np.uint8]

@@ -19,8 +19,8 @@ def register_depth(
 ) -> npt.NDArray[np.float32]:
     """Return the depth image of the colour camera, metres, 0 for pixels without a reading.
 
-    If several readings are projected to one pixel, the nearest is used.  If the depth camera has a smaller
-    focal length in pixels, each reading fills a square of pixels.
+    If several readings are projected to one pixel, the nearest is used.  If the colour camera has a larger
+    focal length in pixels, each reading fills a square of pixels whose side is the ratio, rounded up.
 
     Args:
         depth_m: ``(h, w)``, undistorted depth image of the depth camera, metres, 0 without a reading.

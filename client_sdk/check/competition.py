@@ -18,7 +18,8 @@ from rse_pf.geometry import Array
 __all__ = ["Explanation", "Measured", "explain"]
 
 _MIN_GAIN = 12.0
-"""A fault is selected if it lowers the squared Mahalanobis distance by at least this much."""
+"""A fault is selected if it lowers the squared Mahalanobis distance by at least this much: 3.5 standard
+deviations, squared."""
 _MIN_DIFFERENCE = 9.0
 """A fault whose squared Mahalanobis distance exceeds that of the best one by less than this (three standard
 deviations, squared) is its rival: the estimate does not distinguish them."""

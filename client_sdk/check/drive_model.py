@@ -22,12 +22,13 @@ __all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model", "nearest
 Rows = npt.NDArray[np.int64]
 
 _MIN_LANDMARKS = 20  # fewest known landmarks for the pose of a keyframe, and fewest landmarks of a drive
-_MIN_KEYFRAMES = 5  # fewest connected keyframes that are adjusted
+_MIN_KEYFRAMES = 5  # fewest connected keyframes of a drive that is adjusted
 _PNP = PnpOptions(inlier_px=8.0, max_iterations=100)
 """Options of PnP for the initial poses.  The inlier threshold is wide, since wrong intrinsics cause residuals
 of some pixels."""
 _PIXEL_SIGMA_PX = 0.7  # standard deviation of the pixel of a feature of size 1
-_MIN_INLIER_SHARE = 0.3  # smallest share of inliers of an initial pose
+# Smallest share of the known landmarks of a keyframe that must be inliers of its initial pose.
+_MIN_INLIER_SHARE = 0.3
 # Largest difference, seconds, between the stamp of a depth image and the time at which a depth is wanted.
 _MAX_STAMP_DIFFERENCE_S = 0.07
 # Largest rate of a depth, m/s; faster changes are an edge of an object, and count as a rate of 0.

@@ -15,7 +15,8 @@ __all__ = ["CannotTell", "CheckReport", "FaultKind", "Finding", "matters", "orde
 
 _CERTAIN_SIGMAS = 3.0  # a finding is certain if its value exceeds this many of its standard deviations
 _MIN_COST_M = 0.002  # a fault matters only if it bends the path by more than this, in metres
-_MIN_COST_NOISES = 1.2  # a fault matters only if it bends the path by this many times its uncertainty
+# A fault matters only if it bends the path by more than this many times the uncertainty of the path.
+_MIN_COST_NOISES = 1.2
 
 
 class FaultKind(str, Enum):

@@ -40,7 +40,8 @@ _MIN_STEP_S = 0.45  # shortest time, seconds, over which a motion is compared: s
 _MAX_STEP_S = 1.0  # longest time, seconds, over which a motion is compared
 _MAX_PAIRS = 600  # approximate largest number of motions that are compared: bounds the time
 _MIN_PAIRS = 20  # fewest motions that camera and reference need in common
-_BLOCKS = 10  # number of consecutive parts of a drive from whose differences deviations are computed
+# Number of consecutive parts of a drive from whose differences standard deviations are computed (jackknife).
+_BLOCKS = 10
 _MAX_DELAY_S = 0.5  # largest delay of the stamps, in seconds, that is tried in both directions
 _DELAY_STEP_S = 0.02  # difference, in seconds, of successive delays that are tried
 _DELAY_MODEL_ERROR_S = 0.003  # standard deviation of a delay that remains in every drive, seconds

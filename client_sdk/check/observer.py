@@ -35,7 +35,7 @@ from rse_pf.geometry import Array
 __all__ = ["DriveObserver"]
 
 _HIDING = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS, FaultKind.REPEATED}
-"""Faults that falsify the tracked motion: with one of them, it is not compared with another motion."""
+"""Faults that falsify the tracked motion, which is then not compared with a reference or an IMU."""
 
 
 class DriveObserver:

@@ -22,13 +22,13 @@ __all__ = ["PairsCheck", "check_pairs"]
 
 _KIND = FaultKind.DISPARITY_OFFSET
 _MIN_KEYFRAMES = 12
-"""Fewest adjusted keyframes with which an offset is estimated.  With 5 to 11 keyframes of EuRoC MH_01 the
-estimate was wrong by up to five of its standard deviations."""
+"""Fewest adjusted keyframes with which a disparity offset is reported.  With 5 to 11 keyframes of EuRoC MH_01
+the estimate was wrong by up to five of its standard deviations."""
 _DEVIATION_INFLATION = 1.5  # factor on the standard deviation of the adjustment, which is too small
-_MODEL_DEVIATION_PX = 0.03  # standard deviation of the offset, px, that remains in every drive
-_USUAL_DEVIATION_PX = 0.033  # standard deviation of the offset of a good calibration, px
-_FAULT_DEVIATION_PX = 0.5  # standard deviation of the offset of a wrong calibration, px
-_MIN_OFFSET_PX = 0.1  # smallest offset that is reported, px
+_MODEL_DEVIATION_PX = 0.03  # standard deviation of the disparity offset, px, that remains in every drive
+_USUAL_DEVIATION_PX = 0.033  # standard deviation of the disparity offset of a good calibration, px
+_FAULT_DEVIATION_PX = 0.5  # standard deviation of the disparity offset of a wrong calibration, px
+_MIN_OFFSET_PX = 0.1  # smallest disparity offset that is reported, px
 _MAX_BOUND_PX = 0.3  # largest bound (three standard deviations) with which a drive determines the offset, px
 
 

@@ -24,7 +24,7 @@ from rse_pf.slam.ply import encode_ply
 __all__ = ["encode_nerfstudio"]
 
 _CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Converts points in OpenGL's camera axes (y up, z backwards) to ours (y down, z forwards)."""
+"""Transform of points from OpenGL's camera axes (y up, z backwards) to those of maps (y down, z forwards)."""
 _CLOUD_FILE = "points.ply"  # name of the file with the point cloud, to which transforms.json refers
 
 

@@ -22,7 +22,7 @@ from rse_pf.storage.files import create_private_file
 __all__ = ["FilePlatformRecorder", "make_platform_recorder"]
 
 _CONTROL_PLANE = "control-plane"  # name of the server in the names of the files
-_KEY_BYTES = 32  # size of the key of the pseudonyms
+_KEY_BYTES = 32  # random bytes of the key of the pseudonyms, which its file holds as hex digits
 _UNRECORDED_FIELDS = ("robot", "robots_named", "tenant", "token", "url")
 """Fields of events that are not recorded, since they may hold a name, a secret or an address."""
 

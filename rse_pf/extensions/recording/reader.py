@@ -51,7 +51,9 @@ _MAX_CONNECTIONS = 100_000  # largest number of channels of a file, and of robot
 _MAX_STREAMS = 128
 """Largest number of recorders whose files are merged by time, which opens a file of each; beyond it all files
 are read one after another."""
-_MAX_KEPT_IMAGES = 32  # number of the newest thumbnails, and of the newest odometry poses, kept for a robot
+_MAX_KEPT_IMAGES = 32
+"""Number of thumbnails, and of odometry poses, of each robot that are kept while reading, the newest ones:
+those of a command are searched among them."""
 _MAX_IMAGE_AGE_NS = 500_000_000  # largest age, ns, of the thumbnail or odometry that belongs to a command
 _DAMAGE = (struct.error, ValueError, OverflowError)
 """Exceptions that the library `mcap` raises for malformed records, in addition to McapError."""

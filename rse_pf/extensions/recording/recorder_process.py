@@ -67,7 +67,8 @@ _MAX_FDS = 4  # largest number of file descriptors that are received with one me
 _CHILD = ChildPlan(
     target=f"{__name__}:run", name="rse-pf recorder", policy="batch", nice=5, outlives_parent=True
 )
-_DECODED_KINDS = frozenset({DECODED_COMMAND, ANSWER_WITH_POSE})  # kinds with decoded contents
+# kinds whose id, texts or pose were decoded by a worker
+_DECODED_KINDS = frozenset({DECODED_COMMAND, ANSWER_WITH_POSE})
 _HEX_BYTES = 8  # random bytes of the identifier of a connection, 16 hex digits
 
 
@@ -111,7 +112,7 @@ class RecordedConnection:
         self.channels: dict[Direction, int] = {}
 
     def wire_channel(self, direction: Direction) -> WireChannel:
-        """Return the description of the channel for one direction."""
+        """Return the description of the channel for the messages of this connection in one direction."""
         return WireChannel(
             self.identity, direction, self.codec, self.server, self.redactor.robot, self.redactor.tenant
         )

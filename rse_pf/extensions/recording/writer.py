@@ -167,7 +167,8 @@ class RecordingWriter:
     def add(self, channel: int, time_ns: int, data: bytes) -> None:
         """Add a message to *channel*; *time_ns* is its Unix time.
 
-        Opens a new file if none is open.  If the write fails, the message counts as dropped.
+        Opens a new file if none is open.  If a write fails, this message and those of the unwritten chunk are
+        counted in ``dropped``, and nothing is raised.
         """
         try:
             file = self._file or self._open(time_ns)

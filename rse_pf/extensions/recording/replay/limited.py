@@ -25,8 +25,8 @@ from rse_pf.processes.limited import Handler, LimitedProcesses, Overran, Process
 
 __all__ = ["LimitedReplay", "replayer"]
 
-_MAX_MEMORY_BYTES = 1 << 30  # memory of the process
-_MAX_REPLY_BYTES = 64 << 20  # size of the encoded result of one task
+_MAX_MEMORY_BYTES = 1 << 30  # largest memory of the process in which recordings are read
+_MAX_REPLY_BYTES = 64 << 20  # largest encoded result of one task that the caller accepts
 _MAX_RECORDING_S = 6 * 3600.0
 """Largest CPU time and largest wall time of one task, seconds: enough for a whole recording."""
 _TARGET = "rse_pf.extensions.recording.replay.limited:replayer"  # the function that the process runs
