@@ -471,7 +471,10 @@ def _explains(one: Array, other: Array) -> bool:
 
 
 def _is_certain(one: Array, other: Array) -> bool:
-    """Return whether *one* is below *other* by three standard deviations, from the blocks of the drive."""
+    """Return whether the squares *one* ``(m,)`` sum to less than *other* with three standard deviations.
+
+    The deviation is computed from the differences in ten consecutive blocks of the drive.
+    """
     blocks = np.arange(len(one)) * _BLOCKS // len(one)
     gains = np.array([(other - one)[blocks == block].sum() for block in range(_BLOCKS)])
     return bool(gains.sum() > _CERTAIN_SIGMAS * float(gains.std(ddof=1)) * math.sqrt(_BLOCKS))

@@ -33,7 +33,7 @@ _DISAGREEMENT_RATIO = 2.0
 _QUANTILE = 0.3
 """Quantile of the absolute steps from which their noise is computed.  It is below the median, so that up to
 half of the steps may be jumps."""
-_NORMAL_QUANTILE = 0.385  # this quantile of the absolute values of a normal distribution with deviation 1
+_NORMAL_QUANTILE = 0.385  # 0.3 quantile of the absolute values of a normal distribution with deviation 1
 _MAX_BOUND = 0.08  # largest bound (three standard deviations) with which a drive determines the change
 
 Rows = npt.NDArray[np.int64]

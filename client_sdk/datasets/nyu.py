@@ -32,7 +32,7 @@ __all__ = [
     "register_depth",
 ]
 
-# Pinhole cameras and distortion coefficients (k1 k2 p1 p2 k3) of the data set's Kinect, from its toolbox.
+# Pinhole camera of the undistorted colour images of the data set, from its toolbox.
 COLOUR_CAMERA = Camera(
     fx=518.85790117450188,
     fy=519.46961112127485,
@@ -41,6 +41,7 @@ COLOUR_CAMERA = Camera(
     width=640,
     height=480,
 )
+# Distortion k1 k2 p1 p2 k3 of the colour camera, from the toolbox of the data set.
 _COLOUR_DISTORTION = (
     0.20796615318809061,
     -0.58613825163911781,
@@ -48,6 +49,7 @@ _COLOUR_DISTORTION = (
     1.0479627195765181e-03,
     0.49856986684705107,
 )
+# Pinhole camera of the undistorted depth images of the data set, from its toolbox.
 DEPTH_CAMERA = Camera(
     fx=582.62448167737955,
     fy=582.69103270988637,
@@ -56,6 +58,7 @@ DEPTH_CAMERA = Camera(
     width=640,
     height=480,
 )
+# Distortion k1 k2 p1 p2 k3 of the depth camera, from the toolbox of the data set.
 _DEPTH_DISTORTION = (
     -0.099897236553084481,
     0.39065324602765344,
