@@ -37,8 +37,8 @@ _MIN_KEYFRAMES = 6
 # Factor on the standard deviations of the adjustment, which are too small: residuals are correlated.
 _DEVIATION_INFLATION = 1.5
 _MODEL_DEVIATIONS = np.array([0.005, 0.005, 2.0, 2.0, 0.006, 0.006, 0.003, 0.01, 0.002])
-"""Standard deviations, in the order and units of `UNKNOWNS`, of what the model of the adjustment lacks: higher
-terms of the lens, registration, and errors of depth.  They are multiplied by `_depth_error_factor`."""
+"""Standard deviations, in the order and units of `UNKNOWNS`, of what the model of the adjustment lacks:
+higher terms of the lens, registration, and errors of depth.  `_depth_error_factor` multiplies them."""
 _KINECT_DEPTH_FACTOR = 0.7  # `Calibrated.depth_factor` of a Kinect: its depth noise over the stated noise
 _USUAL_DEVIATIONS = np.array([0.005, 0.005, 2.0, 2.0, 0.01, 0.007, 0.005, 0.03, 0.007])
 """Standard deviations of the errors of a good calibration, in the order and units of `UNKNOWNS`."""

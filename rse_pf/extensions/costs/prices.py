@@ -50,18 +50,20 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         metric_per_month: Price of one detailed or custom CloudWatch metric for a month.
         alarm_metric_per_month: Price of one metric in an alarm of standard resolution for a month.
         alarm_fast_metric_per_month: Price of one metric in an alarm with a period below a minute.
-        metric_calls_per_thousand: Price of a thousand requests that publish metrics, or metrics that are
-        read. balancer_per_hour: Price of the load balancer for an hour, without its addresses.
+        metric_calls_per_thousand: Price of a thousand requests that publish metrics, or of metrics read.
+        balancer_per_hour: Price of the load balancer for an hour, without its addresses.
         balancer_unit_per_hour: Price of one capacity unit for an hour: 3000 connections, or 1 GB an hour.
-        address_per_hour: Price of one public IPv4 address for an hour. endpoint_per_hour: Price of one
-        interface endpoint in one zone for an hour. firewall_per_month: Price of one web ACL for a month.
-        firewall_rule_per_month: Price of one rule of a web ACL for a month. firewall_per_million: Price of a
-        million requests that the web ACL inspects. secret_per_month: Price of one secret for a month.
-        stored_per_gb_month: Price of one GB in S3 standard storage for a month. lambda_per_million: Price of
-        a million executions of a Lambda function. lambda_per_gb_s: Price of one GB of memory of a Lambda
-        function for a second, x86-64. command_cpu_ms: Measured CPU time, ms, of a PnP command with the work
-        of its WebSocket connection. command_bytes: Measured size, bytes, of the message of a PnP command with
-        200 matches in ``zlib``.
+        address_per_hour: Price of one public IPv4 address for an hour.
+        endpoint_per_hour: Price of one interface endpoint in one zone for an hour.
+        firewall_per_month: Price of one web ACL for a month.
+        firewall_rule_per_month: Price of one rule of a web ACL for a month.
+        firewall_per_million: Price of a million requests that the web ACL inspects.
+        secret_per_month: Price of one secret for a month.
+        stored_per_gb_month: Price of one GB in S3 standard storage for a month.
+        lambda_per_million: Price of a million executions of a Lambda function.
+        lambda_per_gb_s: Price of one GB of memory of a Lambda function for a second, x86-64.
+        command_cpu_ms: Measured CPU time, ms, of a PnP command with the work of its WebSocket connection.
+        command_bytes: Measured size, bytes, of the message of a PnP command with 200 matches in ``zlib``.
     """
 
     as_of: Annotated[str, msgspec.Meta(pattern=r"^\d{4}-\d{2}-\d{2}$")]
