@@ -511,7 +511,7 @@ def _reason(row: int, deviation: float, drive: _Drive) -> str:
     yaw, pitch, roll = _rotation_ranges_deg(adjusted)
     moved = _moved_share(adjusted)
     if moved < _MIN_MOVED_SHARE and max(yaw, pitch, roll) < _MIN_ROTATION_DEG:
-        return "the camera neither moves nor rotates"
+        return "the camera neither moves nor turns"
     if adjusted.depth_factor > _MAX_DEPTH_FACTOR:
         return f"depths scatter by {adjusted.depth_factor:.1f} times what those of a Kinect do"
     if row in (_FX, _CX, _FY, _CY):

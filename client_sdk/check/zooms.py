@@ -156,7 +156,7 @@ def _check_steady_change(zooms: Array, times_s: Array, common: Calibrated, zoome
     reason = f"{len(zooms)} views do not tell more"
     if between > _DISAGREEMENT_RATIO * own:
         reason = (
-            f"by parts of the drive, the focal length changes by {low:+.0%} to {high:+.0%}, as with "
+            f"parts of the drive say that the focal length changes by {low:+.0%} to {high:+.0%}, as by "
             f"errors {errors}"
         )
     reason += f": a change within {_CERTAIN_SIGMAS * deviation:.0%}"
