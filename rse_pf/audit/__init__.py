@@ -1,4 +1,5 @@
-"""The audit log: append-only files of JSON lines, one log for each writing process.
+"""The audit log: append-only files of JSON lines that record who did what and when.
 
-What is recorded is decided by the caller; this package bounds, writes and reads entries.
+This package limits the size of entries, writes them to files and reads them.  Which actions are recorded is
+decided by the callers.
 """

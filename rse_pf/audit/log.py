@@ -1,10 +1,12 @@
-"""The files of the audit log: append to one log, and read any.
+"""The files of the audit log: append entries to the log of one writer, and read logs.
 
-A writer appends to ``WHO.jsonl``; a file that has grown large is renamed to ``WHO.NUMBER.jsonl``.  Nothing
-here changes or removes a line, but whoever may write the folder can; Object Lock in S3 protects the copies
-there.  Recording never waits for a disk; entries are durable when `AuditLog.flush` returns True.  While the
-disk is full, entries wait in memory; the number of those that did not fit is recorded once there is space
-again.
+The writer with the name WHO appends to the file ``WHO.jsonl``; a file above 16 MiB is renamed to
+``WHO.NUMBER.jsonl``.  This module never changes or removes a line.  An account that may write in the folder
+can do so; the copies in S3 are protected by Object Lock.
+
+`AuditLog.record` never waits for the disk: entries are durable when `AuditLog.flush` returns True.  While the
+disk is full, up to 20,000 entries wait in memory.  Further entries are lost, and their number is recorded
+when there is space again.
 """
 
 from __future__ import annotations
@@ -40,24 +42,29 @@ CONTROL_PLANE = "control-plane"
 OPERATOR = "operator"
 """Name of the log of operators' commands."""
 SYNC_S = 0.1
-"""Time between two writes to the disk.  A worker waits as long before it sends entries to its supervisor, so
-a machine that fails loses the entries of 0.2 s at most."""
+"""Seconds between two writes of a log to the disk.  A worker waits as long before it sends entries to its
+supervisor, so that the failure of a machine loses the entries of the last 0.2 s at most."""
 _RETRY_S = 1.0
-"""Time between two attempts to write to a disk that is full."""
+"""Seconds between two attempts to write to the disk after a write has failed, such as on a full disk."""
 _GAP = "log.gap"
 """Action of an entry that reports the number of lost entries."""
 _MAX_FILE_BYTES = 16 << 20
-"""A file that is longer is renamed before the next line; it exceeds this by one line at most."""
+"""Size in bytes above which a file is renamed before the next line is written to a new file."""
 _MAX_WAITING = 20_000
-"""Entries that wait for the disk; further ones are lost, and counted."""
+"""Largest number of entries that wait in memory for the disk; further entries are lost, and counted."""
 _MAX_LINE_BYTES = 1 << 18
-"""Above the size of any entry: 64 details of two strings of 200 characters, six bytes each at worst."""
+"""Largest part of a line in bytes that is read at a time.  It is above the size of any entry: 64 details of
+two strings of 200 characters, each encoded in six bytes at worst, are 153,600 bytes."""
 _FILE = re.compile(r"(?P<who>[A-Za-z0-9_-]{1,64})(\.(?P<number>\d{12}))?\.jsonl")
-_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")  # characters that the name of a log must not contain
 
 
 class AuditLog:
-    """A writer of the log *who* in *folder*; several processes may write the same log."""
+    """A writer of one log in a folder; several processes may write the same log.
+
+    Attributes:
+        who: Name of the log.
+    """
 
     def __init__(
         self,
@@ -68,15 +75,16 @@ class AuditLog:
         on_problem: Callable[[str], None],
         max_bytes: int = _MAX_FILE_BYTES,
     ) -> None:
-        """Describe a log; nothing is opened yet.
+        """Prepare a log; no file is opened before `open`.
 
         Args:
-            folder: Created with mode 0700 if it is missing.
-            who: Names the writer; letters that a file name may not have become ``_``.
-            wall_clock: Unix seconds.
-            on_problem: Called with a sentence, in any thread, when writing begins to fail, and when the log
-                is closed without entries that could not be written.
-            max_bytes: A file that is longer is renamed before the next line.
+            folder: Folder of the files; `open` creates it with mode 0700 if it is missing.
+            who: Name of the log.  Every character but ASCII letters, digits, ``_`` and ``-`` is replaced by
+                ``_``, and the name is cut to 64 characters.
+            wall_clock: Returns Unix time in seconds.
+            on_problem: Called with a sentence when writing begins to fail, and when the log is closed while
+                entries are not written; possibly in the thread of `start`.
+            max_bytes: Size in bytes above which a file is renamed before the next line is written.
         """
         self.who = _UNSAFE.sub("_", who)[:64]
         self._on_problem = on_problem
@@ -94,7 +102,11 @@ class AuditLog:
         self._thread: threading.Thread | None = None
 
     def open(self) -> AuditLog:
-        """Open the file; raises ConfigurationError if it cannot be written."""
+        """Create the folder if it is missing, open the file, and return this object.
+
+        Raises:
+            ConfigurationError: The folder or the file cannot be written.
+        """
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._open_file()
@@ -106,23 +118,23 @@ class AuditLog:
         return self
 
     def start(self) -> None:
-        """Write by a thread of its own from now on, `SYNC_S` after the first entry of each batch."""
+        """Start a thread that writes waiting entries to the file, `SYNC_S` after the first of them."""
         self._thread = threading.Thread(target=self._write_on, name="audit", daemon=True)
         self._thread.start()
 
     def record(self, action: str, subject: str = "", /, **detail: Value) -> None:
-        """Record an action of this writer with the next flush.
+        """Add an entry with the present time and this log's name as the actor; the next flush writes it.
 
         Args:
             action: What was done, such as ``robot.enrolled``.
-            subject: The object of the action.
-            **detail: Names, numbers and reasons.
+            subject: On what the action was done, such as a robot.
+            **detail: Further names, numbers and reasons.
         """
         now = self._wall_clock()
         self.add([Entry(time=now, actor=self.who, action=action, subject=subject, detail=detail)])
 
     def add(self, entries: Iterable[Entry]) -> None:
-        """Record *entries* with the next flush; those beyond the limit of memory are lost, and counted."""
+        """Add *entries* for the next flush; beyond 20,000 waiting entries, further ones are lost and counted."""
         with self._buffer_lock:
             for entry in entries:
                 if len(self._waiting) >= _MAX_WAITING:
@@ -132,9 +144,10 @@ class AuditLog:
         self._wake.set()
 
     def flush(self) -> bool:
-        """Write the waiting entries, and return whether all are on the disk; the others stay in memory.
+        """Write the waiting entries to the disk, and return whether all of them were written.
 
-        If only `fsync` fails, entries are written again, and may be in the log twice.
+        Entries that could not be written stay in memory for the next flush.  If the entries were written but
+        fsync(2) failed, they are written again, and are in the log twice.
         """
         with self._writing:
             try:
@@ -149,7 +162,7 @@ class AuditLog:
             return not self._is_failing
 
     def close(self) -> bool:
-        """Write what waits, close the file, and return whether the last write succeeded."""
+        """Write the waiting entries, close the file, and return whether all entries were written."""
         self._closed.set()
         self._wake.set()
         if self._thread is not None:
@@ -162,7 +175,7 @@ class AuditLog:
         return is_written
 
     def _next_batch(self) -> list[Entry]:
-        """Return the waiting entries, followed by one with the number of lost entries if there are any."""
+        """Return the waiting entries, which stay in memory, and an entry `_GAP` if entries were lost."""
         with self._buffer_lock:
             batch = list(self._waiting)
             if self._lost:
@@ -171,7 +184,13 @@ class AuditLog:
             return batch
 
     def _write(self, batch: list[Entry]) -> None:
-        """Append entries of *batch* until the file is full, and forget those that are on the disk."""
+        """Append entries of *batch* until the file is full, and remove those on the disk from the memory.
+
+        If the file was full before, it is renamed first.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         if self._is_full():
             self._rotate()
         count = 0
@@ -195,8 +214,8 @@ class AuditLog:
                 self._lost -= int(written.detail["entries"] or 0)
 
     def _append(self, line: bytes) -> None:
-        """Append one line by one call, so that lines of several writers do not mix."""
-        if self._is_line_cut:  # what was written of it stays a line of its own, which no reader takes
+        """Append a line by one write(2), so that lines of several processes do not mix; raises OSError."""
+        if self._is_line_cut:  # end the cut line, which readers skip
             line = b"\n" + line
         count = os.write(self._fd, line)
         if count < len(line):
@@ -205,7 +224,7 @@ class AuditLog:
         self._is_line_cut = False
 
     def _rotate(self) -> None:
-        """Rename the file, unless another writer has done so, and go on in a new one."""
+        """Rename the full file, unless another process has done so, and open a new one; raises OSError."""
         full = self._fd
         fcntl.flock(full, fcntl.LOCK_EX)
         try:
@@ -220,11 +239,12 @@ class AuditLog:
     def _open_file(self) -> None:
         fd = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, OWNER_ONLY)
         size = os.fstat(fd).st_size
-        self._is_line_cut = size > 0 and os.pread(fd, 1, size - 1) != b"\n"  # a writer was killed
+        self._is_line_cut = size > 0 and os.pread(fd, 1, size - 1) != b"\n"  # a killed writer cut the line
         self._fd = fd
         sync_folder(self._folder)
 
     def _write_on(self) -> None:
+        """Flush after new entries, and again after a failure, until the log is closed; runs in the thread."""
         while not self._closed.is_set():
             self._wake.wait()
             self._closed.wait(_RETRY_S if self._is_failing else SYNC_S)
@@ -242,7 +262,19 @@ def record_once(
     wall_clock: Callable[[], float],
     **detail: Value,
 ) -> None:
-    """Open the log, write one entry and close it; raises ConfigurationError if it cannot be written."""
+    """Open the log *who* in *folder*, write one entry, and close the log.
+
+    Args:
+        folder: Folder of the audit logs.
+        who: Name of the log, and actor of the entry.
+        action: What was done.
+        subject: On what the action was done.
+        wall_clock: Returns Unix time in seconds.
+        **detail: Further names, numbers and reasons.
+
+    Raises:
+        ConfigurationError: The entry cannot be written.
+    """
     problems: list[str] = []
     log = AuditLog(folder, who, wall_clock=wall_clock, on_problem=problems.append).open()
     log.record(action, subject, **detail)
@@ -251,23 +283,23 @@ def record_once(
 
 
 def audit_folder(state: Path) -> Path:
-    """Return the folder of the audit logs of the platform with the state folder *state*."""
+    """Return the folder of the audit logs of the platform whose files are in the folder *state*."""
     return state / "audit"
 
 
 def log_names(folder: Path) -> list[str]:
-    """Return the names of all logs in *folder*."""
+    """Return the sorted names of all logs in *folder*; empty if the folder does not exist."""
     return sorted({match["who"] for match in _files_in(folder).values()})
 
 
 def log_files(folder: Path, who: str) -> list[Path]:
-    """Return the files of one log, oldest first."""
+    """Return the files of the log *who* in *folder*, oldest first; empty if there are none."""
     files = _files_in(folder, who)
     return sorted(files, key=lambda path: files[path]["number"] or "~")
 
 
 def read_entries(path: Path) -> Iterator[Entry]:
-    """Yield the entries of one file; a line that is not an entry is skipped."""
+    """Yield the entries of the file *path* in order; lines that are not valid entries are skipped."""
     with path.open("rb") as file:
         while line := file.readline(_MAX_LINE_BYTES):
             entry = parse_entry(line)
@@ -276,12 +308,12 @@ def read_entries(path: Path) -> Iterator[Entry]:
 
 
 def read_logs(paths: Iterable[Path]) -> list[tuple[str, Entry]]:
-    """Return the name of the log and the entry for all entries of *paths*, in the order of their time."""
+    """Read all entries of the files *paths*; return each with the name of its log, sorted by time."""
     rows = [(path.name.partition(".")[0], entry) for path in paths for entry in read_entries(path)]
     return sorted(rows, key=lambda row: row[1].time)
 
 
 def _files_in(folder: Path, who: str = "") -> dict[Path, re.Match[str]]:
-    """Return the files of the log *who*, or of all, with the parts of their names."""
+    """Return the files of the log *who*, or of all logs if it is "", with the match of each file's name."""
     matches = {path: _FILE.fullmatch(path.name) for path in (folder.iterdir() if folder.is_dir() else ())}
     return {path: match for path, match in matches.items() if match and who in ("", match["who"])}

@@ -1,6 +1,6 @@
-"""Record an operator's commands in the audit log of a platform.
+"""Record the commands of an operator in the audit log of a local platform.
 
-A command that cannot be recorded is not undone; one line on standard error reports it.
+If a command cannot be recorded, it stays done, and a line on standard error reports the missing entry.
 """
 
 from __future__ import annotations
@@ -17,11 +17,15 @@ from rse_pf.terminal import show
 
 __all__ = ["record", "record_map_change"]
 
-_DIRECTORY = "dir:"
+_DIRECTORY = "dir:"  # start of ``data.store`` for a store in a folder
 
 
 def record(state: Path, action: str, subject: str, **detail: Value) -> None:
-    """Record *action* on *subject* in the platform whose files lie in *state*."""
+    """Record that the operator did *action* on *subject*, with the name of the user account.
+
+    The entry goes to the log `OPERATOR` of the platform whose files are in the folder *state*.  If it cannot
+    be written, a line on standard error reports that.
+    """
     try:
         record_once(
             audit_folder(state),
@@ -39,7 +43,15 @@ def record(state: Path, action: str, subject: str, **detail: Value) -> None:
 def record_map_change(
     settings: PlatformSettings, action: str, name: str, *, version: str, number: int
 ) -> None:
-    """Record a change of a map, if its store lies in the folder of a platform with an audit log."""
+    """Record *action* on the map *name*, if its store is in the folder of a platform with an audit log.
+
+    Args:
+        settings: Settings, of which ``data.store`` names the store of the map.
+        action: What was done.
+        name: Tenant and name of the map, as ``TENANT/MAP``.
+        version: Id of the version of the map.
+        number: Number of that version.
+    """
     place = settings.data.store
     state = Path(place.removeprefix(_DIRECTORY)).absolute().parent
     if place.startswith(_DIRECTORY) and audit_folder(state).is_dir():
@@ -49,5 +61,5 @@ def record_map_change(
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a user id without a name
+    except (KeyError, OSError):  # the user id has no account name
         return "unknown"
