@@ -1,4 +1,5 @@
-"""Isolated processes for installed services, one for each robot.
+"""Sandboxes: isolated processes that run installed services, one process for each robot.
 
-Isolation, supervision and IPC of these processes belong here; reading a service folder does not.
+How these processes are isolated, supervised and exchange messages with their worker belongs here; reading the
+folder of an installed service belongs to `rse_pf.services.custom`.
 """

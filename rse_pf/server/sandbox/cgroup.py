@@ -1,9 +1,10 @@
-"""Give each sandbox a cgroup with limits on memory, processes and CPU, where this process may make one.
+"""Limit memory, processes and CPU of each sandbox by a Linux cgroup, where the zygote may make cgroups.
 
-A cgroup is made below the cgroup of this process only, and only in a hierarchy that belongs to the platform:
-its cgroup is the root (a container's own), or a service manager has delegated it (systemd: `Delegate=yes`).
-Cgroups of others are neither changed nor entered.  Sandboxes of a machine without such a hierarchy are held
-by `limit_resources` and `watcher`.
+The zygote, which is the parent process of all sandboxes of a worker, makes cgroups only below its own cgroup,
+and only in a hierarchy that belongs to the platform: its own cgroup is the root of the hierarchy (as in a
+container), or a service manager has delegated it (systemd: ``Delegate=yes``).  Cgroups of other programs are
+neither changed nor entered.  On a machine without such a hierarchy, `isolation.limit_resources` and `watcher`
+limit the sandboxes instead.
 """
 
 from __future__ import annotations
@@ -17,19 +18,26 @@ from pathlib import Path
 __all__ = ["CGROUP_CONTROLLERS", "Cgroups", "Hierarchy", "own_hierarchies"]
 
 CGROUP_CONTROLLERS = ("memory", "pids", "cpu")
-"""What a cgroup of a sandbox limits, where the hierarchy offers it."""
+"""Names of the cgroup controllers that limit a sandbox; a hierarchy may offer only some of them."""
 
-_PREFIX = "rse-pf-sandbox-"
+_PREFIX = "rse-pf-sandbox-"  # start of the names of the sandboxes' cgroups, then zygote's pid and a number
 _SERVER_GROUP = "rse-pf-server"
-"""Cgroup (v2) of the server's own processes: one that holds processes cannot hold cgroups with limits."""
-_DELEGATE_ATTRIBUTES = ("user.delegate", "trusted.delegate")
+"""Name of the cgroup (version 2) into which the server's own processes are moved before sandboxes get theirs:
+a cgroup that contains processes cannot have child cgroups with limits."""
+_DELEGATE_ATTRIBUTES = ("user.delegate", "trusted.delegate")  # set to 1 by systemd on a delegated cgroup
 _SERVER_WEIGHT = 400  # CPU weight of the server: on a busy core it gets four times the time of one sandbox
 _SANDBOX_WEIGHT = 100  # CPU weight of one sandbox, however many threads it has
 
 
 @dataclass(frozen=True, slots=True)
 class Hierarchy:
-    """A folder below which sandboxes get cgroups; ``version`` is that of its interface, 1 or 2."""
+    """A mounted cgroup hierarchy in which the zygote can limit sandboxes.
+
+    Attributes:
+        folder: Folder below which each sandbox gets a cgroup.
+        version: Version of the kernel's cgroup interface, 1 or 2.
+        controllers: Those of `CGROUP_CONTROLLERS` that this hierarchy offers.
+    """
 
     folder: Path
     version: int
@@ -37,7 +45,7 @@ class Hierarchy:
 
 
 def own_hierarchies(proc: Path = Path("/proc/self")) -> list[Hierarchy]:
-    """Return the hierarchies in which this process may make cgroups; empty if there are none.
+    """Return the cgroup hierarchies in which this process may make cgroups; an empty list if there are none.
 
     Args:
         proc: Folder of this process in procfs.
@@ -51,33 +59,39 @@ def own_hierarchies(proc: Path = Path("/proc/self")) -> list[Hierarchy]:
     for line in memberships:
         _, names, path = line.split(":", 2)
         version = 1 if names else 2
-        place = _place(mounts, version, names.split(","), path)
-        if place is None:
+        folder = _cgroup_folder(mounts, version, names.split(","), path)
+        if folder is None:
             continue
-        if place.name == _SERVER_GROUP:  # this process was moved there by an earlier sandbox process
-            place = place.parent
-        elif path != "/" and not _is_delegated(place):
+        if folder.name == _SERVER_GROUP:  # the zygote of another worker moved this process there (`_enable`)
+            folder = folder.parent
+        elif path != "/" and not _is_delegated(folder):
             continue
-        offered = names.split(",") if version == 1 else _words(place / "cgroup.controllers")
+        offered = names.split(",") if version == 1 else _words(folder / "cgroup.controllers")
         usable = tuple(name for name in CGROUP_CONTROLLERS if name in offered)
-        if usable and os.access(place, os.W_OK):
-            hierarchies.append(Hierarchy(place, version, usable))
+        if usable and os.access(folder, os.W_OK):
+            hierarchies.append(Hierarchy(folder, version, usable))
     return hierarchies
 
 
 class Cgroups:
-    """The cgroups of the sandboxes of one zygote; ``controllers`` names what they limit."""
+    """The cgroups of the sandboxes of one zygote.
+
+    Attributes:
+        controllers: Controllers that limit each sandbox; empty before `prepare`, or if no cgroup can be made.
+    """
 
     def __init__(
         self, hierarchies: Sequence[Hierarchy], *, owner: int, memory_bytes: int, max_threads: int
     ) -> None:
-        """Keep the limits; `prepare` makes the first change.
+        """Store the limits; nothing is changed before `prepare`.
 
         Args:
-            hierarchies: Where cgroups are made.
-            owner: Process whose sandboxes these are; part of the names.
-            memory_bytes: Memory of one sandbox, its scratch folder and what the kernel keeps for it included.
-            max_threads: Threads and processes of one sandbox.
+            hierarchies: Hierarchies in which each sandbox gets a cgroup, from `own_hierarchies`.
+            owner: Process id of the zygote.  It is part of the names of the cgroups, so that those of a
+                zygote that has exited are recognised and removed.
+            memory_bytes: Limit of the memory of one sandbox, including its scratch folder and the kernel's
+                memory for it; Linux kills the sandbox above this limit.
+            max_threads: Limit of the threads and processes of one sandbox together.
         """
         self.controllers: tuple[str, ...] = ()
         self._hierarchies = list(hierarchies)
@@ -87,7 +101,11 @@ class Cgroups:
         self._unremoved: set[Path] = set()
 
     def prepare(self) -> None:
-        """Remove what crashed servers left, and drop every hierarchy that does not take a cgroup."""
+        """Try every hierarchy and keep those in which a cgroup can be made; set ``controllers``.
+
+        Empty cgroups of zygotes that have exited are removed.  In a delegated hierarchy of version 2, the
+        server's own processes are moved into the cgroup `_SERVER_GROUP`.
+        """
         usable = []
         for hierarchy in self._hierarchies:
             _remove_leftovers(hierarchy.folder)
@@ -103,11 +121,16 @@ class Cgroups:
                 continue
             usable.append(hierarchy)
         self._hierarchies = usable
-        held = {name for hierarchy in usable for name in hierarchy.controllers}
-        self.controllers = tuple(name for name in CGROUP_CONTROLLERS if name in held)
+        offered = {name for hierarchy in usable for name in hierarchy.controllers}
+        self.controllers = tuple(name for name in CGROUP_CONTROLLERS if name in offered)
 
     def add(self, number: int, pid: int) -> bool:
-        """Move process *pid* into the cgroups of sandbox *number*; return False if one of them failed."""
+        """Make the cgroups of sandbox *number*, and move its process *pid* into them.
+
+        Returns:
+            True, also without any hierarchy; False if a cgroup could not be made, limited or entered.  The
+            caller then kills the sandbox, and removes its cgroups with `remove`.
+        """
         try:
             for hierarchy in self._hierarchies:
                 folder = self._folder(hierarchy, number)
@@ -118,7 +141,14 @@ class Cgroups:
         return True
 
     def remove(self, number: int) -> str:
-        """Remove the cgroups of a sandbox that ended; return the limit that it ended for, or ""."""
+        """Remove the cgroups of sandbox *number*, whose process has exited.
+
+        A cgroup that cannot be removed yet is removed by a later call.
+
+        Returns:
+            A sentence that names the memory limit, if Linux killed a process of the sandbox because of that
+            limit; otherwise "".
+        """
         why = ""
         for hierarchy in self._hierarchies:
             folder = self._folder(hierarchy, number)
@@ -129,7 +159,7 @@ class Cgroups:
         return why
 
     def close(self) -> None:
-        """Try once more to remove what could not be removed."""
+        """Try once more to remove the cgroups of exited sandboxes that could not be removed before."""
         self._remove_ended()
 
     def _remove_ended(self) -> None:
@@ -139,7 +169,7 @@ class Cgroups:
             except FileNotFoundError:
                 pass
             except OSError:
-                continue  # a process is still ending in it; the next removal tries again
+                continue  # a process in this cgroup has not exited yet; the next removal tries again
             self._unremoved.discard(folder)
 
     def _folder(self, hierarchy: Hierarchy, number: int) -> Path:
@@ -150,12 +180,15 @@ class Cgroups:
         for name, value, is_required in self._limits(hierarchy):
             try:
                 _write(folder / name, value)
-            except OSError:  # swap need not be counted on this machine
+            except OSError:  # for instance, this kernel does not count swap
                 if is_required:
                     raise
 
     def _limits(self, hierarchy: Hierarchy) -> Iterable[tuple[str, int, bool]]:
-        """Yield file, value, and whether a cgroup without it is no use."""
+        """Yield the limits of a sandbox in *hierarchy*: file of the cgroup, value, whether it is required.
+
+        If a required file cannot be written, the hierarchy is not used.
+        """
         is_v1 = hierarchy.version == 1
         if "memory" in hierarchy.controllers and is_v1:
             yield "memory.limit_in_bytes", self._memory_bytes, True
@@ -170,8 +203,15 @@ class Cgroups:
             yield "cpu.weight", _SANDBOX_WEIGHT, True
 
 
-def _place(mounts: Sequence[str], version: int, controllers: Sequence[str], path: str) -> Path | None:
-    """Return the folder of cgroup *path*; None if its hierarchy is not mounted here."""
+def _cgroup_folder(mounts: Sequence[str], version: int, controllers: Sequence[str], path: str) -> Path | None:
+    """Return the folder in which the cgroup *path* is mounted; None if its hierarchy is not mounted.
+
+    Args:
+        mounts: Lines of ``/proc/self/mountinfo``.
+        version: Version of the cgroup interface, 1 or 2.
+        controllers: Controllers of the hierarchy (version 1 only).
+        path: Path of the cgroup in its hierarchy, from ``/proc/self/cgroup``.
+    """
     for line in mounts:
         before, _, after = line.partition(" - ")
         kind, _, options = after.split(" ", 2)
@@ -187,7 +227,7 @@ def _place(mounts: Sequence[str], version: int, controllers: Sequence[str], path
 
 
 def _is_delegated(folder: Path) -> bool:
-    """Return whether a service manager gave this cgroup, and what is below it, to its processes."""
+    """Return whether systemd has delegated the cgroup *folder* to the processes in it (``Delegate=yes``)."""
     for name in _DELEGATE_ATTRIBUTES:
         with contextlib.suppress(OSError):
             if os.getxattr(folder, name) == b"1":
@@ -196,10 +236,13 @@ def _is_delegated(folder: Path) -> bool:
 
 
 def _enable(hierarchy: Hierarchy) -> None:
-    """Enable the controllers of *hierarchy* below it; move the server's processes out of its folder.
+    """Enable the controllers of a version 2 hierarchy for the cgroups below its folder.
+
+    Unless the folder is the root of the hierarchy, all processes in it are moved to the cgroup
+    `_SERVER_GROUP` first.  Does nothing if all controllers are enabled already.
 
     Raises:
-        OSError: Refused, or the processes of a cgroup that was not delegated would have to be moved.
+        OSError: The kernel refused the change, or the folder is neither the root nor delegated.
     """
     folder = hierarchy.folder
     control = folder / "cgroup.subtree_control"
@@ -222,7 +265,7 @@ def _enable(hierarchy: Hierarchy) -> None:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove the empty cgroups of zygotes that have exited."""
+    """Remove the empty cgroups below *folder* that were made by zygotes that have exited."""
     for cgroup in folder.glob(f"{_PREFIX}*-*"):
         owner = cgroup.name.removeprefix(_PREFIX).partition("-")[0]
         if owner.isdigit() and not Path("/proc", owner).exists():
@@ -231,6 +274,7 @@ def _remove_leftovers(folder: Path) -> None:
 
 
 def _oom_kills(folder: Path, version: int) -> int:
+    """Return how many processes of a cgroup Linux killed for its memory limit; 0 if that is not known."""
     try:
         lines = (folder / ("memory.oom_control" if version == 1 else "memory.events")).read_text()
     except OSError:

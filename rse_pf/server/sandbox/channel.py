@@ -1,8 +1,8 @@
-"""The channel between a worker and one sandbox: messages, and what the sandbox prints.
+"""The worker's side of the channel to one sandbox: a socket for messages and a pipe for printed output.
 
-A hostile service can send any message itself.  Neither it nor a slow one can block the event loop or fill the
-worker's memory: the size of a message, its values and levels, and the number and length of printed lines have
-limits, and `outcome_of` checks the form of each message.
+A hostile service can send any bytes to the worker.  Neither a hostile nor a slow service can block the event
+loop or fill the worker's memory: size, number of values and nesting depth of a message are limited, and so
+are number and length of printed lines.  `outcome_of` checks the types in each message.
 """
 
 from __future__ import annotations
@@ -21,14 +21,18 @@ from rse_pf.services.custom.output import OutputLines
 
 __all__ = ["MAX_COMPUTE_MS", "IpcChannel", "is_ready", "outcome_of"]
 
-MAX_COMPUTE_MS = 86_400_000.0  # a longer time in a reply is malformed: no command takes a day
-_MAX_TEXT = 500  # characters of a failure's message and hint that reach the robot
-_READ_BYTES = 1 << 18
-_NO_MESSAGE = object()
+MAX_COMPUTE_MS = 86_400_000.0  # longest computing time in a reply: one day; a longer one is malformed
+_MAX_TEXT = 500  # longest message and longest hint of a service's failure in characters; longer ones are cut
+_READ_BYTES = 1 << 18  # bytes read from the socket or the pipe at a time, so that the event loop stays free
+_NO_MESSAGE = object()  # marks the end of the complete messages, because a message may be None
 
 
 class IpcChannel:
-    """A socket and an output pipe to one sandbox; pass on ``theirs`` and ``their_output``, then `start`."""
+    """A socket and an output pipe between the worker and one sandbox.
+
+    The caller passes the sandbox's ends, ``theirs`` (socket) and ``their_output`` (descriptor of the pipe),
+    to the sandbox and then calls `start`.
+    """
 
     def __init__(
         self,
@@ -39,15 +43,15 @@ class IpcChannel:
         on_fault: Callable[[str], None],
         on_line: Callable[[str], None],
     ) -> None:
-        """Open both.
+        """Open the socket and the pipe; nothing is read before `start`.
 
         Args:
             loop: Event loop of the worker.
-            max_bytes: Limit of one message from the sandbox.
-            on_message: Called with each message.
-            on_fault: Called once with the reason when the sandbox sent an invalid message, with "" when
-                it closed the socket.
-            on_line: Called with each line that the service printed, as `OutputLines` bounds them.
+            max_bytes: Largest message from the sandbox in bytes.
+            on_message: Called with each decoded message.
+            on_fault: Called at most once, after which no message is read: with a reason when the sandbox sent
+                a message that is too large or not MessagePack, with "" when it closed the socket.
+            on_line: Called with each line that the service printed; `OutputLines` limits length and rate.
         """
         self._loop = loop
         self._frames = FrameReader(max_bytes)
@@ -63,25 +67,28 @@ class IpcChannel:
         os.set_blocking(self._output, False)
 
     def start(self) -> None:
-        """Close the sandbox's ends, which it has by now, and read from ours."""
+        """Close the worker's copies of the sandbox's ends, and begin to read in the event loop."""
         self.theirs.close()
         os.close(self.their_output)
         self._loop.add_reader(self._socket.fileno(), self._read_messages)
         self._loop.add_reader(self._output, self._read_output)
 
     def send(self, data: bytes) -> None:
-        """Write an encoded message as soon as the socket takes it."""
+        """Send an encoded message without blocking; what the socket does not take now is sent later."""
         self._unsent += data
         self._flush()
 
     def stop_reading(self) -> None:
-        """Take no further message, not even one that was received: the sandbox is being killed."""
+        """Ignore all further messages, including those already received, because the sandbox is being killed.
+
+        Printed output is still read.
+        """
         if self._is_reading:
             self._is_reading = False
             self._loop.remove_reader(self._socket.fileno())
 
     def close(self) -> None:
-        """Read what was printed last, and close both."""
+        """Read the rest of the printed output, and close socket and pipe; a second call does nothing."""
         if self._socket.fileno() < 0:
             return
         self.stop_reading()
@@ -101,7 +108,7 @@ class IpcChannel:
         except BlockingIOError:
             pass
         except OSError:
-            self._unsent.clear()  # the sandbox has ended, which the reader reports
+            self._unsent.clear()  # the sandbox has exited; the next read of the socket reports that
         if self._unsent:
             self._loop.add_writer(self._socket.fileno(), self._flush)
         else:
@@ -148,7 +155,7 @@ class IpcChannel:
 
 
 def is_ready(message: object) -> bool:
-    """Return whether *message* reports that the sandbox has started."""
+    """Return whether *message* is ``["ready"]``: the sandbox is isolated, and takes requests."""
     match message:
         case [str(word)]:
             return word == "ready"
@@ -156,11 +163,13 @@ def is_ready(message: object) -> bool:
 
 
 def outcome_of(message: object) -> SandboxReply | RsePfError:
-    """Return the outcome of a request in *message*: a reply, or the typed failure of the service.
+    """Return the reply of a service in a sandbox's *message*, or the error with which the service failed.
+
+    A message is ``[True, value, snapshot, ms]`` or ``[False, code, text, hint, ms]``, where *ms* is the
+    computing time in milliseconds.
 
     Raises:
-        BadMessage: Its parts have other types, or its time is not a number of milliseconds from 0 to
-            `MAX_COMPUTE_MS`.
+        BadMessage: The message has another form, or its time is not a number from 0 to `MAX_COMPUTE_MS`.
     """
     match message:
         case [True, value, (None | bytes()) as snapshot, compute_ms] if _is_time(compute_ms):

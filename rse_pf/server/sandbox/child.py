@@ -1,7 +1,7 @@
-"""The process of one sandbox: isolate itself, then answer the requests of the worker until it is ended.
+"""The process of one sandbox: isolate itself, then answer requests of its worker until it is killed.
 
-One process, one thread, one socket to its worker.  No code of a service runs before the isolation is
-complete, and whatever a service raises becomes a typed failure.
+A sandbox is one process with one thread and one socket to its worker.  No code of a service runs before the
+isolation is complete.  An exception of a service does not end the process: it is answered as an error.
 """
 
 from __future__ import annotations
@@ -31,33 +31,37 @@ from rse_pf.services.custom.runtime import Runtime, open_runtime
 
 __all__ = ["SandboxPlan", "readable_paths", "run_sandbox"]
 
-_UNBUFFERED = 2  # ``_IONBF`` of the GNU C library and of musl
-_MAX_PROBLEM = 150  # characters of the reason why a reply cannot be encoded
+_UNBUFFERED = 2  # mode of setvbuf(3) without a buffer: ``_IONBF`` of the GNU C library and of musl
+_MAX_PROBLEM = 150  # longest reason in characters why a reply cannot be encoded; a longer one is cut
 _REPLY_HINT = "reply with numbers, text, bytes, lists, maps and arrays of numbers"
-_FRAMES_SHOWN = -3  # the last frames of a traceback, which are those of the service
-_LOADER_CACHE = Path("/etc/ld.so.cache")
+_FRAMES_SHOWN = -3  # a printed traceback has the last three frames only, which are those of the service
+_LOADER_CACHE = Path("/etc/ld.so.cache")  # the dynamic loader's list of shared libraries
 _SYSTEM_PATHS = (
     str(_LOADER_CACHE), "/etc/localtime", "/usr/lib/locale", "/usr/share/zoneinfo",
 )  # fmt: skip
+"""Files and folders of the system that every sandbox may read: libraries' paths, time zones and locales."""
 _LINKS = (Path("/lib"), Path("/lib64"))
-"""Links of a system with a merged /usr, by which the loader and libraries name files."""
+"""Symbolic links to folders in /usr on most systems; programs name the loader and libraries by them."""
 _SHARED_PREFIXES = ("/usr", "/usr/local")
-"""Prefixes of a Python that shares its ``lib`` folder with the system."""
+"""Installation prefixes of Python whose ``lib`` folder also has files of other programs; a sandbox reads only
+Python's part of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SandboxPlan:
-    """The values that all sandboxes of a server share.
+    """The services, limits and isolation that all sandboxes of one zygote have in common.
 
     Attributes:
         services: The installed services by name.
-        readable: The paths of `readable_paths`.
-        memory_bytes: Memory of one sandbox.
-        scratch_bytes: Size of its scratch folder.
-        max_bytes: Largest reply.
-        missing: The means of isolation that this kernel lacks.
-        copies: The `VerifiedCopy` that a sandbox sees in place of each folder.
-        refused: The error of each service that is not loaded, by name.
+        readable: Paths that a sandbox may read, from `readable_paths`.
+        memory_bytes: Memory of one sandbox in bytes, including its scratch folder.
+        scratch_bytes: Size in bytes of the scratch folder, the only folder that a sandbox can write.
+        max_bytes: Largest message in bytes with which a sandbox replies.
+        missing: Names of `ISOLATION` that this machine lacks; a sandbox runs without them.
+        copies: For each folder of an installed service and of its packages, the folder of the verified copy
+            (`VerifiedCopy`) that a sandbox sees at its path.
+        refused: For the name of each service that sandboxes do not load, because its files were changed, the
+            error.
     """
 
     services: Mapping[str, InstalledService]
@@ -71,27 +75,30 @@ class SandboxPlan:
 
 
 def readable_paths(services: Sequence[InstalledService]) -> list[Path]:
-    """Return the paths that a sandbox may read: Python, this package, system libraries, the services.
+    """Return the files and folders that a sandbox may read.
 
-    Programs, documentation, settings and homes are not among it.
+    They are Python's modules, ``rse_pf``, shared libraries, time zones and locales, and the folders of
+    *services* and of their packages.  Programs, configuration files and home folders are not included.
     """
     package = Path(__file__).resolve().parents[2]
     modules = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
     if sys.base_prefix not in _SHARED_PREFIXES:
-        modules.append(f"{sys.base_prefix}/lib")  # libraries that its modules link to, as in conda
+        modules.append(f"{sys.base_prefix}/lib")  # shared libraries that Python's modules need, as in conda
     names = [*_SYSTEM_PATHS, *_library_folders(), *modules, *site.getsitepackages()]
     packages = [service.dependencies for service in services if service.dependencies is not None]
     return [*map(Path, names), package, *(service.folder for service in services), *packages]
 
 
 def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -> None:
-    """Become a sandbox and serve; never returns.
+    """Isolate this process, send ``["ready"]``, and answer requests until the worker closes the socket.
+
+    Never returns: the process exits, with code 1 if the isolation failed.
 
     Args:
-        plan: What to run and how much it may use.
-        channel: Socket to the worker.
-        output: Where the service's standard output and error go.
-        uid: User to become, if this process is root.
+        plan: Services, limits and isolation.
+        channel: Descriptor of the socket to the worker.
+        output: Descriptor to which standard output and error are written.
+        uid: User id that the process takes, if it is root; None keeps the user.
     """
     code = 1
     try:
@@ -102,7 +109,7 @@ def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -
             connection.sendall(encode_message(["ready"]))
             _serve(plan, connection)
         code = 0
-    except BaseException:  # noqa: BLE001  the process ends here, and its output is the log
+    except BaseException:  # noqa: BLE001  the process exits here; the worker logs its output
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -111,7 +118,10 @@ def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -
 
 
 def _library_folders() -> list[str]:
-    """Return the folders in which the loader's cache lists libraries, without a cache all of /lib."""
+    """Return the folders of shared libraries, from the dynamic loader's cache.
+
+    Without a cache these are ``/lib`` and ``/usr/lib``.  The symbolic links `_LINKS` are included.
+    """
     try:
         listed = re.findall(rb"(/[^\0]+)/[^\0/]+\0", _LOADER_CACHE.read_bytes())
     except OSError:
@@ -122,6 +132,7 @@ def _library_folders() -> list[str]:
 
 
 def _reset_process(output: int) -> None:
+    """Reset signal handlers and the environment; read from ``/dev/null``, and print to the pipe *output*."""
     signal.set_wakeup_fd(-1)
     for number in (signal.SIGCHLD, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
@@ -134,7 +145,7 @@ def _reset_process(output: int) -> None:
 
 
 class _WrittenAtOnce(io.BufferedWriter):
-    """Keeps nothing back; unlike a raw file it writes all of what a full pipe takes in parts."""
+    """A writer that flushes after each write; unlike a raw file, it writes all bytes even to a full pipe."""
 
     def write(self, data: Any, /) -> int:
         count = super().write(data)
@@ -143,7 +154,7 @@ class _WrittenAtOnce(io.BufferedWriter):
 
 
 def _unbuffer_output() -> None:
-    """Write what Python, C, C++ and Lua print at once: a process that is killed flushes nothing."""
+    """Make Python, C, C++ and Lua write printed text at once, because a killed process flushes nothing."""
     for name, fd in (("stdout", 1), ("stderr", 2)):
         writer = _WrittenAtOnce(io.FileIO(fd, "w", closefd=False))
         stream = io.TextIOWrapper(writer, "utf-8", "backslashreplace", "\n", write_through=True)
@@ -153,6 +164,7 @@ def _unbuffer_output() -> None:
 
 
 def _isolate(plan: SandboxPlan, uid: int | None) -> None:
+    """Apply every means of `ISOLATION` that this machine has; the zygote has entered the namespaces."""
     owner = os.getuid() if uid is None else uid
     if "root" not in plan.missing:
         isolation.make_root(plan.readable, plan.scratch_bytes, owner, plan.copies)
@@ -160,7 +172,7 @@ def _isolate(plan: SandboxPlan, uid: int | None) -> None:
     isolation.limit_resources(plan.memory_bytes, plan.scratch_bytes, alone=alone)
     if "privileges" not in plan.missing:
         isolation.give_up_privileges(uid)
-    die_with_parent()  # after the change of the user, which would undo it
+    die_with_parent()  # after give_up_privileges: a change of the user id clears this setting
     if "seccomp" not in plan.missing:
         languages = {service.language for service in plan.services.values()}
         isolation.forbid_system_calls(
@@ -177,7 +189,7 @@ def _serve(plan: SandboxPlan, connection: socket.socket) -> None:
             answer = _answer(plan, runtimes, kind, name, value)
         except RsePfError as error:
             answer = [False, error.code, error.message, error.hint]
-        except BaseException as error:  # noqa: BLE001  foreign code may raise anything, SystemExit too
+        except BaseException as error:  # noqa: BLE001  a service may raise anything, SystemExit included
             traceback.print_exc(limit=_FRAMES_SHOWN)
             text = f"{type(error).__name__} in service {name!r}"
             answer = [False, InternalError.code, text, "the server's log has it"]
@@ -186,6 +198,16 @@ def _serve(plan: SandboxPlan, connection: socket.socket) -> None:
 
 
 def _answer(plan: SandboxPlan, runtimes: dict[str, Runtime], kind: str, name: str, value: Any) -> list[Any]:
+    """Execute a request to service *name*, which is loaded first if needed; return the answer.
+
+    *kind* ``call`` passes the request *value* to the service and returns ``[True, reply, snapshot]``: the
+    snapshot is the state after the call, None if the service has no snapshots.  *kind* ``restore`` sets the
+    state to the snapshot *value* and returns ``[True, has_snapshots, None]``.
+
+    Raises:
+        InternalError: The service cannot be loaded; the reason is printed.
+        BaseException: The service raised it.
+    """
     runtime = runtimes.get(name)
     if runtime is None:
         try:
@@ -207,7 +229,11 @@ def _answer(plan: SandboxPlan, runtimes: dict[str, Runtime], kind: str, name: st
 
 
 def _encode_within(answer: list[Any], max_bytes: int) -> bytes:
-    """Return the message of *answer*, or of a failure: it is too large, or holds what no message can."""
+    """Return the encoded *answer*; if it is too large or cannot be encoded, an encoded failure instead.
+
+    The failure is LimitExceeded for an answer of more than *max_bytes*, or with too many values or levels;
+    InternalError for an answer that contains a value of a type that has no encoding.
+    """
     try:
         data = encode_reply(answer)
     except LimitExceeded as error:

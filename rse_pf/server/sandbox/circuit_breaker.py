@@ -1,20 +1,20 @@
 """Decide which services and requests are refused after crashes of their sandboxes, and to which robots.
 
-- Circuit breaker: a service whose sandboxes of one robot ended ``breaker_crashes`` times within `WINDOW_S` is
-  refused to that robot for `OPEN_S`.
-- Poison request: a request that crashed `POISON_CRASHES` sandboxes of one robot is refused to it for
-  `POISON_S`.
+- Circuit breaker: a service whose sandboxes of one robot crashed or overran ``services.breaker_crashes``
+  times within `WINDOW_S` is refused to that robot for `OPEN_S`.
+- Poison request: a request that crashed `POISON_CRASHES` sandboxes of one robot is refused to that robot for
+  `POISON_S`.  Two requests are the same if the SHA-256 digests of their messages are equal.
 
-Both apply to other robots only if their sandboxes crashed as well:
+Both refusals are extended to other robots only if sandboxes of several robots crashed:
 
-- to all robots of a tenant if sandboxes of at least `ROBOTS_OF_A_TENANT` of its robots crashed;
-- to all robots if sandboxes of at least as many robots crashed, and at least `ROBOTS_OF_OTHERS` of these
-  robots do not belong to the tenant that has the most of them.  No tenant can make a service unavailable to
-  another.
+- to all robots of a tenant if sandboxes of at least `ROBOTS_OF_A_TENANT` robots of this tenant crashed;
+- to all robots if sandboxes of at least `ROBOTS_OF_A_TENANT` robots crashed, and at least `ROBOTS_OF_OTHERS`
+  of these robots do not belong to the tenant with the most such robots.  A single tenant can therefore not
+  make a service unavailable to other tenants.
 
-A sandbox that was killed because the deadline of its robot had passed did not crash.  Such overruns count for
-that robot alone, and never make a request poison.  Time is an argument, and memory is bounded whatever robots
-send.
+An overrun means that a sandbox was killed because its command took too long.  Overruns count for their robot
+alone, and never make a request poison.  Time is an argument.  The numbers of crashes, requests and circuit
+breakers in memory are bounded.
 
 Source:
     Nygard 2007, "Release It!" (circuit breaker).
@@ -43,30 +43,37 @@ __all__ = [
     "CircuitBreaker",
 ]
 
-WINDOW_S = 30.0  # ``services.breaker_crashes`` ends within this time open the circuit breaker
-OPEN_S = 60.0  # a circuit breaker stays open for this time, then the service is tried again
-POISON_CRASHES = 2  # one crash may be that of the service; the retry of the same request is the second one
-POISON_S = 600.0  # a poison request is tried again after this time
-ROBOTS_OF_A_TENANT = 3  # robots whose sandboxes crashed, before the others of their tenant are refused
-ROBOTS_OF_OTHERS = 2  # of them from other tenants, before all robots are refused
-_MAX_REQUESTS = 10_000  # requests whose crashes are remembered; the oldest are forgotten first
-_MAX_ENDS_OF_REQUEST = 32  # crashes remembered of one request
-_MAX_ENDS_OF_SERVICE = 1024  # crashes and overruns remembered of one service
-_MAX_BREAKERS = 10_000  # circuit breakers remembered; the one that opened first is forgotten first
-_MAX_REQUESTS_LISTED = 1000  # requests in a list for an operator, so that it does not delay the worker
+WINDOW_S = 30.0  # seconds within which ``services.breaker_crashes`` crashes or overruns open a breaker
+OPEN_S = 60.0  # seconds for which an open circuit breaker refuses a service; then the service is tried again
+POISON_CRASHES = 2  # crashes that make a request poison: after a crash, the request is retried once
+POISON_S = 600.0  # seconds for which a poison request is refused, counted from the crashes that prove it
+ROBOTS_OF_A_TENANT = 3  # robots with crashed sandboxes from which on all robots of their tenant are refused
+ROBOTS_OF_OTHERS = 2  # robots with crashes outside the most affected tenant, before all robots are refused
+_MAX_REQUESTS = 10_000  # most requests whose crashes are stored; the one that crashed longest ago is removed
+_MAX_ENDS_OF_REQUEST = 32  # most crashes that are stored for one request; the oldest is removed first
+_MAX_ENDS_OF_SERVICE = 1024  # most crashes and overruns that are stored for one service; oldest removed first
+_MAX_BREAKERS = 10_000  # most circuit breakers that are stored; the one that opened first is removed first
+_MAX_REQUESTS_LISTED = 1000  # requests that `blocks` checks, the newest: more would delay the worker
 
 Reason = Literal["crashes", "overruns", "poison"]
 Scope = RobotId | str | None
-"""The robots to which something is refused: one robot, all of a tenant (its name), or all (None)."""
+"""The robots that are refused: one robot, all robots of a tenant (its name), or all robots (None)."""
 
 
 class _End(NamedTuple):
+    """A sandbox of *robot* crashed at *at_s* (monotonic seconds), or was killed for an overrun."""
+
     at_s: float
     robot: RobotId
     is_crash: bool = True
 
 
 class _Breaker(NamedTuple):
+    """A circuit breaker that opened; times are monotonic seconds.
+
+    ``overruns`` says that the last end of a sandbox before it opened was an overrun, not a crash.
+    """
+
     opened_s: float
     until_s: float
     overruns: bool
@@ -74,15 +81,16 @@ class _Breaker(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """A refusal after crashes, for operators.
+    """A refusal after crashes or overruns, as operators see it.
 
     Attributes:
         service: Name of the service.
-        reason: "crashes" or "overruns" for an open circuit breaker, "poison" for requests.
-        tenant: Tenant to which it applies; None means all tenants.
-        robot: Name of the robot to which it applies; None means all robots of the tenant.
-        requests: Number of poison requests, of the latest thousand; 0 for a circuit breaker.
-        left_s: Seconds until the refusal ends, the last one for several requests.
+        reason: "crashes" or "overruns" for an open circuit breaker, by what opened it; "poison" for requests.
+        tenant: Tenant whose robots are refused; None means all tenants.
+        robot: Name of the robot that is refused; None means all robots of the tenant.
+        requests: Number of poison requests among the latest 1,000 requests that crashed; 0 for a circuit
+            breaker.
+        left_s: Seconds until the refusal ends; for several poison requests until the last of them ends.
     """
 
     service: str
@@ -94,17 +102,28 @@ class Block:
 
 
 class CircuitBreaker:
-    """The crashes and overruns of the sandboxes of one worker, and the refusals that follow from them."""
+    """The crashes and overruns of the sandboxes of one worker, and the refusals that follow from them.
+
+    All times are monotonic seconds.
+    """
 
     def __init__(self, settings: ServiceSettings, *, poison_crashes: int = POISON_CRASHES) -> None:
         self._settings = settings
         self._poison_crashes = poison_crashes
         self._ends_of_request: OrderedDict[tuple[str, str], tuple[_End, ...]] = OrderedDict()
+        """By name of the service and digest of the request; the request that crashed last is the last."""
         self._ends_of_service: dict[str, deque[_End]] = {}
         self._breakers: dict[tuple[str, Scope], _Breaker] = {}
+        """By name of the service and refused robots; the circuit breaker that opened last is the last."""
 
     def refusal(self, robot: RobotId, service: str, digest: str, now: float) -> Poison | WorkerLost | None:
-        """Return the error with which the request with this digest is refused to *robot*; None runs it."""
+        """Return the error with which a request of *robot* to *service* is refused now; None if it may run.
+
+        Returns:
+            Poison if the request with this *digest* is a poison request for *robot*; otherwise WorkerLost,
+            with the time until the next attempt, if a circuit breaker of *service* is open for *robot*.  None
+            if neither is the case.
+        """
         ends = self._ends_of_request.get((service, digest), ())
         if ends and any(self._poison_until(scope, ends) > now for scope in _scopes_of(robot)):
             return Poison(
@@ -121,7 +140,7 @@ class CircuitBreaker:
         return _refusal_of(service, last, last.until_s - now)
 
     def note_crash(self, robot: RobotId, service: str, digest: str, now: float) -> None:
-        """Note that a sandbox of *robot* crashed while it worked on this request."""
+        """Note that a sandbox of *robot* crashed while it worked on the request with this *digest*."""
         end, key = _End(now, robot), (service, digest)
         self._count(service, end)
         before = self._ends_of_request.pop(key, ())
@@ -130,16 +149,19 @@ class CircuitBreaker:
             self._ends_of_request.popitem(last=False)
 
     def note_overrun(self, robot: RobotId, service: str, now: float) -> None:
-        """Note that a sandbox was killed because *robot*'s own deadline had passed."""
+        """Note that a sandbox of *robot* was killed because *service* had taken too long for a command."""
         self._count(service, _End(now, robot, is_crash=False))
 
     def open_services(self, now: float) -> list[str]:
-        """Return the services that are refused now to more than one robot, sorted."""
+        """Return the sorted names of the services that are refused now to all robots or to a whole tenant."""
         shared = (key for key, breaker in self._breakers.items() if breaker.until_s > now)
         return sorted({service for service, scope in shared if not isinstance(scope, RobotId)})
 
     def blocks(self, now: float) -> list[Block]:
-        """Return all refusals at *now* (s), those to most robots first, and then by name."""
+        """Return all refusals that are in force at *now*.
+
+        Refusals to several robots come before those to single ones, which are sorted by the robot's name.
+        """
         blocks = [
             _block(service, scope, "overruns" if breaker.overruns else "crashes", 0, breaker.until_s - now)
             for (service, scope), breaker in self._breakers.items()
@@ -159,13 +181,16 @@ class CircuitBreaker:
     def unblock(
         self, now: float, *, service: str | None = None, tenant: str | None = None, robot: str | None = None
     ) -> list[Block]:
-        """Lift the matching refusals, forget the crashes that caused them, and return them.
+        """Lift the matching refusals, and remove the stored crashes and overruns of the matching robots.
 
         Args:
             now: Monotonic seconds.
-            service: Name of a service; None means every service.
-            tenant: Lift only refusals to this tenant or to a robot of it; None means all.
-            robot: Name of a robot of *tenant*; lift only refusals to this robot.
+            service: Lift only refusals of this service; None means every service.
+            tenant: Lift only refusals to this tenant or to one of its robots; None means all refusals.
+            robot: Lift only refusals to the robot of this name; None means all refusals that match *tenant*.
+
+        Returns:
+            The lifted refusals.
         """
 
         def matches(name: str, block_tenant: str | None, block_robot: str | None) -> bool:
@@ -188,7 +213,10 @@ class CircuitBreaker:
         return lifted
 
     def _count(self, service: str, end: _End) -> None:
-        """Count the *end* of a sandbox, and open the circuit breakers that follow from it."""
+        """Store the *end* of a sandbox, and open the circuit breakers of *service* that have enough evidence.
+
+        A circuit breaker opens again only if all ends that count for it came after it last opened.
+        """
         ends = self._ends_of_service.setdefault(service, deque(maxlen=_MAX_ENDS_OF_SERVICE))
         ends.append(end)
         while ends[0].at_s < end.at_s - WINDOW_S:
@@ -220,9 +248,11 @@ class CircuitBreaker:
 
 
 def _evidence_since(scope: Scope, ends: Sequence[_End], count: int) -> float:
-    """Return the start of the shortest run of the latest *ends* that justifies a refusal to *scope*.
+    """Return since when there is sufficient evidence for a refusal to *scope*; -inf if there is none.
 
-    It is -inf if there is none.
+    The evidence is the smallest number of latest *ends* that contains *count* ends of robots in *scope*, and
+    enough robots for *scope* (`_is_wide_enough`).  The result is the time in seconds of the first of these.
+    Overruns count only if *scope* is one robot.
     """
     robots, ends_in_scope = set[RobotId](), 0
     for end in reversed(ends):
@@ -235,6 +265,7 @@ def _evidence_since(scope: Scope, ends: Sequence[_End], count: int) -> float:
 
 
 def _is_wide_enough(scope: Scope, robots: set[RobotId]) -> bool:
+    """Return whether crashes at *robots* justify a refusal to all robots of *scope*."""
     if isinstance(scope, RobotId):
         return True
     if len(robots) < ROBOTS_OF_A_TENANT:
@@ -244,11 +275,12 @@ def _is_wide_enough(scope: Scope, robots: set[RobotId]) -> bool:
 
 
 def _scopes_of(robot: RobotId) -> tuple[Scope, ...]:
+    """Return the scopes that contain *robot*: itself, its tenant, and all robots."""
     return robot, robot.tenant, None
 
 
 def _tenant_and_name(scope: Scope) -> tuple[str | None, str | None]:
-    """Return tenant and name of the robots of *scope*; None means any."""
+    """Return tenant and name of the robots of *scope*; None stands for all tenants, or all robots."""
     return (scope.tenant, scope.name) if isinstance(scope, RobotId) else (scope, None)
 
 

@@ -1,6 +1,7 @@
-"""Call one installed service as a server would, without a server: used by `rse-pf service test`.
+"""Call one service in a sandbox without a server, for ``rse-pf service test``.
 
-The sandbox, isolation and limits are those of a server; sockets and robots are missing.
+The sandbox and its limits are those of a server.  There is no network connection and no robot.  The service
+also runs if this machine lacks a means of isolation, and its snapshots are kept in memory.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _ROBOT = RobotId(DEFAULT_TENANT, _SERVER)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DryRun:
-    """The answer to one request, and how long it took."""
+    """The answer to one request, and the milliseconds from the submission of the request to the answer."""
 
     answer: Result | Failure
     took_ms: float
@@ -39,25 +40,26 @@ def dry_run(
     settings: PlatformSettings,
     say: Callable[[str], None],
 ) -> tuple[tuple[str, ...], list[DryRun]]:
-    """Send each payload to *service* in one sandbox.
+    """Send *payloads* as commands to *service* in a sandbox, each after the answer to the one before.
 
     Args:
-        service: A folder that was read; it need not be installed.
-        payloads: Requests, sent one after the other.
-        settings: Limits.
-        say: Called with each line that the service prints, and with the reason of each crash.
+        service: The service; its folder need not be in the services folder of a server.
+        payloads: Payloads of the commands.
+        settings: Limits of sandboxes; the deadline of a command is ``session.answer_timeout_s``.
+        say: Called with each line that the service prints, and with each error event of the sandbox and its
+            reason.
 
     Returns:
-        The means of isolation that this machine lacks, and the answer to each payload.
+        Names of `ISOLATION` that this machine lacks, and one `DryRun` for each payload, in order.
 
     Raises:
-        ConfigurationError: The zygote did not start.
+        ConfigurationError: The zygote, the parent process of the sandbox, did not start.
     """
     return asyncio.run(_dry_run(service, payloads, settings, say))
 
 
 class _Printer:
-    """Log events of a sandbox as lines for a person."""
+    """A log that passes printed output and error events of a sandbox to *say*, and drops everything else."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
@@ -67,7 +69,7 @@ class _Printer:
             self._say(str(fields["text"]))
 
     def warning(self, event: str, **fields: Any) -> None:
-        pass  # missing isolation is returned
+        pass  # `dry_run` returns the missing isolation; an overrun is in the answer
 
     def error(self, event: str, **fields: Any) -> None:
         self._say(f"{event}: {fields.get('reason', '')}")

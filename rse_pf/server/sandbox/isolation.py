@@ -1,8 +1,8 @@
-"""Isolate the calling process: namespaces, a root of its own, limits, no new privileges, seccomp.
+"""Isolate the calling process: namespaces, a root folder of its own, limits, no privileges, seccomp.
 
-Each function applies one means by plain Linux calls.  One that the kernel refuses raises
-`IsolationUnavailable` with its name; `exec` undoes none of them.
-Source: the paper's Fig. 4 gives each robot an isolated environment; the means are ours.
+Each function applies one means of isolation to the calling process by Linux system calls; the process cannot
+undo it.  A function whose system call the kernel refuses raises `IsolationUnavailable`.
+Source: the paper's Fig. 4 gives each robot an isolated environment; it does not say by which means.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ __all__ = [
 ]
 
 ISOLATION = ("namespaces", "root", "privileges", "seccomp")
-"""Names of the means that a kernel may lack; limits on resources always hold."""
+"""Names of the means of isolation that a kernel or an account may lack.  Limits on resources, which
+`limit_resources` sets, are not among them, because every kernel has them."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -47,6 +48,7 @@ _CLONE_NEWUSER = 0x10000000
 _CLONE_NEWPID = 0x20000000
 _CLONE_NEWNET = 0x40000000
 _MOUNT_POINTS = tuple(map(Path, ("/mnt", "/media", "/srv", "/opt", "/tmp", "/run")))
+"""Folders on one of which the root of a sandbox is mounted: the first that no sandbox has to read."""
 # Flags of mount(2), linux/mount.h.
 _MS_NOSUID = 0x2
 _MS_NODEV = 0x4
@@ -59,29 +61,36 @@ _AT_RECURSIVE = 0x8000
 _MOUNT_ATTR_RDONLY = 0x1
 _MOUNT_ATTR_NOSUID = 0x2
 _MOUNT_ATTR_NODEV = 0x4
-_SYS_MOUNT_SETATTR = 442
-_SYS_PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
-_SECCOMP_MODE_FILTER = 2
-_CAP_VERSION_3 = 0x20080522
+_SYS_MOUNT_SETATTR = 442  # number of the system call on every machine
+_SYS_PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}  # number of the system call by machine
+_SECCOMP_MODE_FILTER = 2  # mode of prctl(PR_SET_SECCOMP), linux/seccomp.h
+_CAP_VERSION_3 = 0x20080522  # version of the arguments of capset(2), linux/capability.h
 _LAST_CAP = 63  # highest number of a capability that the kernel interface allows
-_MAX_THREADS = 64  # of one sandbox, so that a service cannot exhaust the process ids of the machine
-_ROOT_INODES = 4096  # files and folders of the root, most of which are mount points
-_BYTES_PER_INODE = 4096  # of the scratch folder, so that many small files take no further kernel memory
+_MAX_THREADS = 64  # most threads of one sandbox, so that a service cannot exhaust the machine's process ids
+_ROOT_INODES = 4096  # most files and folders in the root of a sandbox, most of which are mount points
+_BYTES_PER_INODE = 4096  # one file per 4 KiB of the scratch folder, so that small files fill no kernel memory
 
 
 class IsolationUnavailable(Exception):
-    """This kernel or this account lacks a means of isolation; ``args`` are its name and the reason."""
+    """Raised if this kernel or account lacks a means of isolation.
+
+    ``args`` are the name of the means, from `ISOLATION`, and the reason.
+    """
 
 
 def missing_isolation(tries: Sequence[Callable[[], None]]) -> list[str]:
-    """Call each of *tries*, one for each of `ISOLATION`, in a child process; return the names that failed."""
+    """Try every means of isolation in a child process of its own, and return the names of those that fail.
+
+    Args:
+        tries: For each name of `ISOLATION`, in that order, a function that applies this means.
+    """
     missing = []
     for name, isolate in zip(ISOLATION, tries, strict=True):
         child = os.fork()
         if child == 0:
             try:
                 isolate()
-            except BaseException:  # noqa: BLE001  the exit code reports it
+            except BaseException:  # noqa: BLE001  exit code 1 reports the failure to the parent
                 os._exit(1)
             os._exit(0)
         if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0:
@@ -90,9 +99,14 @@ def missing_isolation(tries: Sequence[Callable[[], None]]) -> list[str]:
 
 
 def enter_namespaces() -> None:
-    """Enter new namespaces of network, mounts, processes and IPC; a plain user becomes its own root.
+    """Enter new Linux namespaces for network, mounts, processes, IPC and host name.
 
-    The process namespace begins with the next child.
+    A process that does not run as root also enters a user namespace of its own, in which it holds the
+    capabilities to mount a root.  Only children that are forked from now on are in the namespace of
+    processes.
+
+    Raises:
+        IsolationUnavailable: The kernel refuses namespaces to this account.
     """
     flags = _CLONE_NEWNS | _CLONE_NEWPID | _CLONE_NEWNET | _CLONE_NEWIPC | _CLONE_NEWUTS
     uid, gid = os.getuid(), os.getgid()
@@ -111,13 +125,21 @@ def enter_namespaces() -> None:
 def make_root(
     readable: Sequence[Path], scratch_bytes: int, owner: int, copies: Mapping[Path, Path] | None = None
 ) -> None:
-    """Make a root of *readable* paths (read-only), three devices and an empty ``/scratch``, and enter it.
+    """Make a new root folder for this process and enter it; call `enter_namespaces` first.
+
+    The root contains the *readable* paths and the *copies*, all read-only, the devices ``null``, ``zero`` and
+    ``urandom``, and an empty folder ``/scratch`` in memory, which becomes the current folder.  Unless one of
+    these paths lies in ``/tmp``, ``/tmp`` is a symbolic link to ``/scratch``.
 
     Args:
-        readable: Files and folders that keep their names; missing ones are left out.
-        scratch_bytes: Size of the scratch folder, in memory; it may hold one file per 4,096 bytes of that.
-        owner: User of the scratch folder.
-        copies: Folders, and what is shown in their places (read-only).
+        readable: Files and folders that the process can read under their own paths; missing ones are left
+            out.
+        scratch_bytes: Size of ``/scratch`` in bytes.  It can hold one file for every 4,096 bytes of its size.
+        owner: User id that owns ``/scratch``.
+        copies: For each path, the folder whose content is seen there instead.
+
+    Raises:
+        IsolationUnavailable: The kernel refuses to mount, or each of `_MOUNT_POINTS` has readable paths.
     """
     copies = copies or {}
     _mount(None, "/", None, _MS_REC | _MS_PRIVATE, None)
@@ -150,15 +172,16 @@ def make_root(
 
 
 def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> None:
-    """Bound address space, file size, open files and threads; no core files.
+    """Limit address space, file size, open files (64) and threads (64) of this process; forbid core files.
 
-    Processes are bounded by seccomp, processor time by the deadline.
+    The number of processes is not limited here, because seccomp forbids new ones.  Neither is CPU time: a
+    sandbox is killed some time after the deadline of its command.
 
     Args:
-        memory_bytes: Address space and scratch folder together.
-        scratch_bytes: Scratch folder, and the longest file in it.
-        alone: Whether the user or the user namespace belongs to this sandbox alone, so that its threads
-            can be counted.
+        memory_bytes: Limit in bytes of address space and scratch folder together.
+        scratch_bytes: Size in bytes of the scratch folder, which is also the limit of one file.
+        alone: Whether the user id or the user namespace belongs to this sandbox alone.  Threads are limited
+            only then, because Linux counts the threads of a user, not of a process.
     """
     if alone:
         resource.setrlimit(resource.RLIMIT_NPROC, (_MAX_THREADS, _MAX_THREADS))
@@ -174,10 +197,20 @@ def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> No
 
 
 def give_up_privileges(uid: int | None) -> None:
-    """Become *uid* (root only; None stays), hold no capability and never gain one."""
+    """Change to user *uid*, drop all capabilities, and forbid to gain any again by set-user-id programs.
+
+    Files that the process makes from now on are readable by *uid* alone, and other processes of this user
+    cannot trace the process.
+
+    Args:
+        uid: User and group id to change to, which only root can; None keeps the user.
+
+    Raises:
+        IsolationUnavailable: The kernel refuses a change of the capabilities.
+    """
     for capability in range(_LAST_CAP + 1):
         if prctl(PR_CAPBSET_DROP, capability) != 0:
-            break  # past the last one, or not allowed to: the sets below are emptied anyway
+            break  # no such capability, or no permission; capset below removes all capabilities anyway
     if uid is not None:
         os.setgroups([])
         os.setresgid(uid, uid, uid)
@@ -190,7 +223,11 @@ def give_up_privileges(uid: int | None) -> None:
 
 
 def forbid_system_calls(languages: Collection[str] = LANGUAGES) -> None:
-    """Refuse from now on every system call that none of *languages* needs; `seccomp` has the lists."""
+    """Refuse from now on every system call that services in *languages* do not need (`seccomp`).
+
+    Raises:
+        IsolationUnavailable: There is no filter for this machine, or the kernel does not accept filters.
+    """
     machine = os.uname().machine
     if machine not in MACHINES or struct.calcsize("P") != 8:
         raise IsolationUnavailable("seccomp", f"no filter is written for {machine}")
@@ -202,7 +239,11 @@ def forbid_system_calls(languages: Collection[str] = LANGUAGES) -> None:
 
 
 def _free_mount_point(readable: Sequence[Path]) -> str:
-    """Return a folder to mount the new root on; no readable path may lie below it."""
+    """Return the first folder of `_MOUNT_POINTS` that exists and has no *readable* path in it.
+
+    Raises:
+        IsolationUnavailable: There is no such folder.
+    """
     for place in _MOUNT_POINTS:
         if place.is_dir() and not any(Path(path).is_relative_to(place) for path in readable):
             return str(place)
@@ -210,7 +251,10 @@ def _free_mount_point(readable: Sequence[Path]) -> str:
 
 
 def _outermost(paths: Sequence[Path]) -> list[Path]:
-    """Return *paths* without those inside another one, in an order in which they can be mounted."""
+    """Return *paths* without those that lie inside another of them, ordered by depth.
+
+    A path below a symbolic link among *paths* is kept, because a link is copied and not followed.
+    """
     chosen: list[str] = []
     inside: tuple[str, ...] = ()
     for path in sorted({os.path.normpath(path) for path in paths}, key=lambda name: name.count("/")):
@@ -222,7 +266,10 @@ def _outermost(paths: Sequence[Path]) -> list[Path]:
 
 
 def _bind(path: Path, place: Path, base: str) -> None:
-    """Show *path* as *place* below *base*."""
+    """Mount *path* read-only at *place* in the new root folder *base*; copy it if it is a symbolic link.
+
+    Does nothing if *path* does not exist.
+    """
     target = base + str(place)
     if path.is_symlink():
         os.makedirs(os.path.dirname(target), mode=0o755, exist_ok=True)
@@ -242,6 +289,7 @@ def _bind(path: Path, place: Path, base: str) -> None:
 
 
 def _read_only(path: str, *, recursive: bool) -> None:
+    """Make the mount at *path* read-only, and ignore device files and set-user-id bits in it."""
     attributes = struct.pack("=QQQQ", _MOUNT_ATTR_RDONLY | _MOUNT_ATTR_NOSUID | _MOUNT_ATTR_NODEV, 0, 0, 0)
     flags = _AT_RECURSIVE if recursive else 0
     _call("root", _LIBC.syscall, _SYS_MOUNT_SETATTR, -1, path.encode(), flags, attributes, len(attributes))
@@ -253,5 +301,6 @@ def _mount(source: str | None, target: str, kind: str | None, flags: int, data: 
 
 
 def _call(means: str, function: Callable[..., int], *arguments: object) -> None:
+    """Call a function of the C library; raise IsolationUnavailable for *means* if its result is not 0."""
     if function(*arguments) != 0:
         raise IsolationUnavailable(means, os.strerror(ctypes.get_errno()))

@@ -1,7 +1,9 @@
-"""Execute what `policy` decides about the sandboxes of one worker: processes, messages, timers and the store.
+"""Execute the actions that `policy` decides for the sandboxes of one worker.
 
-The paper's Fig. 4 gives each robot an isolated environment of its own.  Nothing here blocks the event loop
-once the zygote has started.
+`SandboxManager` passes events to `SandboxPolicy` and executes the returned actions: it starts and kills
+processes through the zygote, sends messages, sets timers, and reads and writes snapshots.  The event loop is
+blocked only by `SandboxManager.start`, until the zygote is ready, and by `SandboxManager.close`.
+Source: the paper's Fig. 4 gives each robot an isolated environment.
 """
 
 from __future__ import annotations
@@ -48,21 +50,28 @@ __all__ = ["SandboxHost", "SandboxManager"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SandboxHost:
-    """The worker that sandboxes run for."""
+    """What sandboxes need of the worker whose commands they execute.
+
+    Attributes:
+        server_id: Id of the backend server, a field of every answer.
+        loop: Event loop of the worker.
+        monotonic: Clock of the deadlines, in seconds.
+        log: Receives the printed output of services, and crashes of sandboxes.
+        answer: Called exactly once for each submitted command whose robot stays connected.
+    """
 
     server_id: str
-    """Goes into answers."""
     loop: AbstractEventLoop
     monotonic: Callable[[], float]
-    """Clock of deadlines, s."""
     log: Log
-    """Gets what services print."""
     answer: Callable[[QueuedCommand, Result | Failure], None]
-    """Called exactly once for each submitted command whose robot stays connected."""
 
 
 class SandboxManager:
-    """The sandboxes of one worker."""
+    """The sandboxes of one worker for a fixed set of installed services, and their zygote.
+
+    All methods are called in the event loop of the worker.
+    """
 
     def __init__(
         self,
@@ -74,19 +83,16 @@ class SandboxManager:
         host: SandboxHost,
         on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
-        """Start the zygote and wait until it is ready.
+        """Prepare; no process is started before `start`.
 
         Args:
-            services: As installed and checked.
-            settings: Limits and grace.
-            max_sandboxes: Sandboxes of this worker at a time.
-            store: Where snapshots are kept; None keeps none.
-            host: The worker.
-            on_ready: As for `ZygoteClient`: if given, nothing blocks, and nothing may be submitted before it
-                was called.
-
-        Raises:
-            ConfigurationError: A means of isolation is missing and weak isolation was not accepted.
+            services: The installed services, whose hashes were verified.
+            settings: Limits of sandboxes, and the grace period after the last connection of a robot.
+            max_sandboxes: Most sandboxes of this worker at a time.
+            store: Object store for snapshots of the state of services; None stores no snapshots.
+            host: Event loop, clock, log and answers of the worker.
+            on_ready: If given, `start` does not wait for the zygote; the function is called when the zygote
+                is ready or has exited (see `ZygoteClient`), and no command may be submitted before.
         """
         self._policy = SandboxPolicy(
             {service.name: service.kind for service in services},
@@ -104,7 +110,10 @@ class SandboxManager:
         self._answer = host.answer
         self._channels: dict[int, IpcChannel] = {}
         self._working: set[int] = set()
-        """Sandboxes that were sent a request and have not replied; all others are paused."""
+        """Numbers of the sandboxes that were sent a request and have not replied.
+
+        A sandbox is paused by SIGSTOP after a message to the worker, until it is sent the next request.
+        """
         self._actions: deque[Action] = deque()
         self._is_executing = False
         self._timer: TimerHandle | None = None
@@ -115,30 +124,41 @@ class SandboxManager:
         )  # fmt: skip
 
     def start(self) -> SandboxManager:
-        """Start the zygote; return this object.  Raises ConfigurationError, see `ZygoteClient.start`."""
+        """Start the zygote and return this object; waits until the zygote is ready, unless *on_ready* is set.
+
+        Raises:
+            ConfigurationError: The zygote did not start, or a means of isolation is missing and weak
+                isolation is not accepted (see `ZygoteClient.start`).
+        """
         self._zygote.start()
         return self
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """The means of isolation that this machine lacks."""
+        """Names of `isolation.ISOLATION` that this machine lacks; empty before the zygote is ready."""
         return self._zygote.missing
 
     def offers(self, service: str) -> bool:
-        """Return whether *service* is an installed one."""
+        """Return whether *service* is the name of one of the installed services."""
         return service in self._names
 
     @property
     def held(self) -> int:
-        """Commands that wait or run."""
+        """Number of commands that wait for their sandbox or run in it."""
         return self._policy.held
 
     def waiting_of(self, robot: RobotId) -> int:
-        """Return how many commands of *robot* wait."""
+        """Return how many commands of *robot* wait for its sandbox; a running command is not counted."""
         return self._policy.waiting_of(robot)
 
     def report(self) -> dict[str, Any]:
-        """Return the state and the counts of this worker's sandboxes for /readyz and /metrics."""
+        """Return state and counts of the sandboxes for ``/readyz`` and ``/metrics``.
+
+        Returns:
+            ``sandboxes``: number of sandboxes; ``missing_isolation``: means of isolation that this machine
+            lacks; ``open_breakers``: services refused to all robots or to a whole tenant; ``counts``: how
+            often sandboxes were created, released, crashed and overran, and poison requests were refused.
+        """
         return {
             "sandboxes": self._policy.sandboxes,
             "missing_isolation": list(self.missing),
@@ -147,52 +167,63 @@ class SandboxManager:
         }
 
     def cpu_by_tenant(self) -> dict[str, float]:
-        """Return for how long the sandboxes of each tenant have worked at requests, in seconds."""
+        """Return the elapsed seconds for which the sandboxes of each tenant have worked on requests.
+
+        It is the time from each request to its reply; the CPU time of a sandbox is not measured.
+        """
         return dict(self._policy.worked_s)
 
     def blocks(self) -> list[Block]:
-        """Return the services and requests that are refused now after crashes, with their robots."""
+        """Return all refusals of services and requests that are in force now after crashes or overruns."""
         return self._policy.breaker.blocks(self._monotonic())
 
     def unblock(self, service: str | None, tenant: str | None, robot: str | None) -> list[Block]:
-        """Lift the matching blocks (None matches everything), and return them."""
+        """Lift the refusals that match all arguments (None matches everything), and return them."""
         return self._policy.breaker.unblock(self._monotonic(), service=service, tenant=tenant, robot=robot)
 
     def add_connection(self, robot: RobotId) -> None:
-        """Note a connection of *robot*."""
+        """Count one more connection of *robot*, which keeps its sandbox."""
         self._policy.add_connection(robot)
 
     def remove_connection(self, robot: RobotId) -> None:
-        """Note the end of a connection; after the last one and a grace period the sandbox is released."""
+        """Count one connection of *robot* less.
+
+        After the last connection, the waiting commands of the robot are dropped without an answer, and its
+        sandbox is released after the grace period ``services.grace_s``.
+        """
         self._policy.remove_connection(robot, self._monotonic())
         self._execute([])
 
     def submit(self, queued: QueuedCommand) -> None:
-        """Run *queued* in its robot's sandbox; the answer comes through the callback."""
+        """Run the command *queued* in the sandbox of its robot; the answer is passed to `SandboxHost.answer`.
+
+        The command waits for earlier commands of the robot.  It may be refused, for instance while all
+        sandboxes are in use; then the error is the answer.
+        """
         data = encode_message(["call", queued.command.service, queued.command.payload])
         call = SandboxCall(queued, hashlib.sha256(data).hexdigest(), data)
         self._execute(self._policy.submit(call, self._monotonic()))
 
     def close(self) -> None:
-        """End every sandbox and the zygote."""
+        """Kill every sandbox, and wait until the zygote has exited (it is killed after 0.5 s)."""
         self._execute(self._policy.close())
         self._zygote.close()
 
     def retire(self) -> None:
-        """End every sandbox, and the zygote without waiting for it."""
+        """Kill every sandbox, and end the zygote without blocking the event loop."""
         self._execute(self._policy.close())
         if self._timer is not None:
             self._timer.cancel()
         self._zygote.retire()
 
-    # --- events ------------------------------------------------------------------------------------
+    # --- events of processes, messages and timers, which are passed to the policy --------------------
 
     def on_gone(self, number: int, how: str) -> None:
-        """Sandbox *number* ended; *how* says by what."""
+        """Handle the end of the process of sandbox *number*; *how* is the reason in words."""
         self._execute(self._policy.on_exit(number, how, self._monotonic()))
 
     def on_lost(self) -> None:
-        """The zygote ended, and every sandbox with it."""
+        """Handle the end of the zygote, with which every sandbox was killed."""
         self._execute(self._policy.on_all_exited("the zygote ended", self._monotonic()))
 
     def _on_fault(self, number: int, why: str) -> None:
@@ -219,10 +250,13 @@ class SandboxManager:
         self._timer, self._timer_s = None, math.inf
         self._execute(self._policy.tick(self._monotonic()))
 
-    # --- actions -----------------------------------------------------------------------------------
+    # --- execution of the actions that the policy returned -------------------------------------------
 
     def _execute(self, actions: list[Action]) -> None:
-        """Execute *actions*; those that follow from them come after them, in order."""
+        """Execute *actions* in order, then set the timer for `SandboxPolicy.wake_s`.
+
+        An action may cause an event whose actions are executed after all actions of the first call.
+        """
         self._actions.extend(actions)
         if self._is_executing:
             return
@@ -283,7 +317,7 @@ class SandboxManager:
         )
 
     def _set_timer(self) -> None:
-        """Wake up when the policy needs it; a timer that is early costs less than one more cancelled."""
+        """Set a timer for `SandboxPolicy.wake_s`, unless an earlier one is set: that one sets the next."""
         wake_s = self._policy.wake_s
         if wake_s >= self._timer_s:
             return
@@ -292,10 +326,10 @@ class SandboxManager:
         self._timer_s = wake_s
         self._timer = self._loop.call_later(max(0.0, wake_s - self._monotonic()), self._on_timer)
 
-    # --- snapshots ---------------------------------------------------------------------------------
+    # --- snapshots of the state of services in the object store ---------------------------------------
 
     def _ask_store(self, number: int, call: SandboxCall, function: Callable[..., Any], *args: Any) -> None:
-        """Run a function of the store in a thread, and pass its result or error to the policy."""
+        """Run `_load` or `_save` in a thread, and pass the result or the exception to the policy."""
 
         def done(future: Any) -> None:
             outcome = future.exception() or future.result()
@@ -306,7 +340,7 @@ class SandboxManager:
 
 
 def _load(store: ObjectStore, robot: RobotId, service: str) -> bytes | None:
-    """Return the snapshot, None if there is none; raises StoreError."""
+    """Return the stored snapshot of *service* for *robot*, None if there is none; raises StoreError."""
     try:
         return store.get(state_name(robot, service))
     except NotFound:
@@ -314,4 +348,10 @@ def _load(store: ObjectStore, robot: RobotId, service: str) -> bytes | None:
 
 
 def _save(store: ObjectStore, robot: RobotId, service: str, expected: bytes | None, data: bytes) -> None:
+    """Replace the stored snapshot *expected* (None: there is none) by *data*.
+
+    Raises:
+        Conflict: Another snapshot than *expected* is stored.
+        StoreError: The store failed.
+    """
     store.compare_and_swap(state_name(robot, service), expected, data)

@@ -1,19 +1,23 @@
-"""Decide what happens to the sandboxes of one worker: start, retry, deadline, kill, grace, capacity.
+"""Decide when the sandboxes of one worker start, receive commands, are killed and are released.
 
-Events come in as method calls with the time, `Action` values come out, and `manager` executes them in
-order.  The rules:
+Each event is a method call with the time, and returns `Action` values, which `manager` executes in order.
+A worker has ``max_sandboxes`` places for sandboxes.  The rules:
 
-- Each robot has at most one sandbox, which works on one command at a time; the others wait in order.
+- Each robot has at most one sandbox, which works on one command at a time; other commands of the robot wait
+  in order.
 - A command whose sandbox crashed is retried once in a new sandbox, unless its deadline has passed, its
-  service keeps state that no snapshot holds, or `CircuitBreaker` refuses it.
-- A command is answered at its deadline; its sandbox is killed at a multiple of the deadline, which is no
+  service keeps state that is in no snapshot, or `CircuitBreaker` refuses the command.
+- A command without a result at its deadline is answered by an error.  If the service still works on the
+  command after `_DEADLINE_FACTOR` times the allowed time, its sandbox is killed; that does not count as a
   crash.
-- A sandbox outlives the last connection of its robot by a grace period, unless its place is needed.
-- When all places are taken, a robot gets the place of a sandbox in its grace period, or else, by
-  `largest_holder`, that of the sandbox which has been idle longest of the tenant that holds most.  If all of
-  them work, the place of the first that ends its command is kept for the robot's tenant for `_KEPT_S`.
-  State that no snapshot holds is lost.
-- Commands that wait for a sandbox which crashed move to the new one.
+- A sandbox is kept for a grace period after the last connection of its robot, unless another robot needs its
+  place.
+- When all places are taken, a new robot gets the place of a sandbox in its grace period.  If there is none,
+  it gets the place of the longest idle sandbox of the tenant with the most sandboxes, if that tenant has at
+  least two more than the tenant of the new robot (`largest_holder`).  If all those sandboxes work on
+  commands, the new robot is refused, but the first place that becomes free is kept for its tenant for
+  `_KEPT_S`.  State that is in no snapshot is lost with a sandbox.
+- Commands that wait for a sandbox which crashed move to its successor.
 """
 
 from __future__ import annotations
@@ -48,17 +52,25 @@ __all__ = [
     "SendMessage",
 ]
 
-START_TIMEOUT_S = 5.0  # a sandbox that is not ready within this time is killed
-_MAX_TRIES = 2  # of a command whose sandbox crashed: the crash may have had another cause
-_BUSY_RETRY_MS = 1000.0  # pause of a robot that gets no sandbox
-_KEPT_S = 3.0  # a free place is kept for a tenant: its refused robot has sent again within this time
+START_TIMEOUT_S = 5.0  # seconds after which a sandbox that has not reported its start is killed
+_MAX_TRIES = 2  # sandboxes in which one command runs at most: a crash may have another cause than the command
+_BUSY_RETRY_MS = 1000.0  # milliseconds after which a robot that got no sandbox is asked to send again
+_KEPT_S = 3.0  # seconds for which a free place is kept for a refused tenant: above `_BUSY_RETRY_MS`
 _DEADLINE_HINT = "set a longer deadline, or send fewer commands to this service"
-_DEADLINE_FACTOR = 2.0  # a sandbox is killed when its command has taken this many times its deadline
+_DEADLINE_FACTOR = 2.0  # a sandbox is killed after this many times the time that its command is allowed
 
 
 @dataclass(eq=False, slots=True)
 class SandboxCall:
-    """A command on its way through a sandbox; ``data`` is the message that asks for it."""
+    """A command that a sandbox is to execute.
+
+    Attributes:
+        queued: The command with its robot and deadline.
+        digest: SHA-256 in hex of *data*, by which `CircuitBreaker` recognises the same request.
+        data: The encoded message with which the sandbox is asked to execute the command.
+        tries: How many sandboxes ended while they worked on the command.
+        is_answered: Whether the robot has an answer; a later result is dropped.
+    """
 
     queued: QueuedCommand
     digest: str
@@ -68,13 +80,19 @@ class SandboxCall:
 
     @property
     def service(self) -> str:
-        """Name of the service."""
+        """Name of the service that the command calls."""
         return self.queued.command.service
 
 
 @dataclass(frozen=True, slots=True)
 class SandboxReply:
-    """What a service returned, and the state that belongs to it (None: it keeps none)."""
+    """The reply of a service to a request.
+
+    Attributes:
+        value: The decoded reply.
+        compute_ms: Time in milliseconds that the sandbox needed for the request.
+        snapshot: State of the service after the request; None if the service has no snapshots.
+    """
 
     value: Any
     compute_ms: float
@@ -83,7 +101,7 @@ class SandboxReply:
 
 @dataclass(frozen=True, slots=True)
 class CreateSandbox:
-    """Start a process for *robot* and report `on_ready` or `on_exit`."""
+    """Start sandbox *number* for *robot*; call `SandboxPolicy.on_ready` when it is ready, or `on_exit`."""
 
     number: int
     robot: RobotId
@@ -91,7 +109,7 @@ class CreateSandbox:
 
 @dataclass(frozen=True, slots=True)
 class SendMessage:
-    """Send *data* to the sandbox and report what it `on_reply`."""
+    """Send the encoded message *data* to sandbox *number*; call `SandboxPolicy.on_reply` with its answer."""
 
     number: int
     data: bytes
@@ -99,21 +117,21 @@ class SendMessage:
 
 @dataclass(frozen=True, slots=True)
 class KillSandbox:
-    """Kill the process; `on_exit` follows."""
+    """Kill the process of sandbox *number*; call `SandboxPolicy.on_exit` when it has exited."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseSandbox:
-    """Kill the process, if it runs, and free what belongs to it; nothing more is reported of it."""
+    """Kill the process of sandbox *number*, if it runs, and close its channel; its events end here."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
 class LoadSnapshot:
-    """Read the last snapshot of the service and report `on_store_reply`."""
+    """Read the stored snapshot of the robot and service of *call* for `SandboxPolicy.on_store_reply`."""
 
     number: int
     call: SandboxCall
@@ -121,7 +139,10 @@ class LoadSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class SaveSnapshot:
-    """Replace the snapshot *expected* by *data* and report `on_store_reply`."""
+    """Store the snapshot *data* for the robot and service of *call*, if *expected* is the stored snapshot.
+
+    *expected* is None if no snapshot is stored.  The result is passed to `SandboxPolicy.on_store_reply`.
+    """
 
     number: int
     call: SandboxCall
@@ -131,7 +152,7 @@ class SaveSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class AnswerCall:
-    """Answer the robot; at most once for each call."""
+    """Answer *call* with a reply or an error; there is at most one such action for each call."""
 
     call: SandboxCall
     outcome: SandboxReply | RsePfError
@@ -139,9 +160,13 @@ class AnswerCall:
 
 @dataclass(frozen=True, slots=True)
 class LogEnd:
-    """Log that a sandbox crashed, or was killed because the deadline of its robot had passed.
+    """Log that a sandbox of *robot* crashed, or was killed because a command took too long.
 
-    ``service`` is "" if it ran none.
+    Attributes:
+        robot: The robot.
+        service: Name of the service that the sandbox worked for; "" if it worked on no command.
+        reason: Why and how the process ended, in words.
+        is_crash: False if the sandbox was killed because its command took too long.
     """
 
     robot: RobotId
@@ -164,34 +189,55 @@ Action = (
 
 @dataclass(eq=False, slots=True)
 class _Sandbox:
+    """One sandbox; times are monotonic seconds.
+
+    Attributes:
+        number: Number of the sandbox, which is never used again.
+        robot: The robot whose commands it executes.
+        kill_s: When the sandbox is killed, because it has not started, or its command takes too long.
+        state: ``starting`` until it is ready, ``idle`` without a command; for the running call ``loading``
+            (the snapshot is read from the store), ``restoring`` (the sandbox sets the state of the service to
+            the snapshot), ``running`` (the service is called), ``saving`` (the new snapshot is stored);
+            ``dying`` after an idle sandbox was ordered to be killed.
+        waiting: Commands that wait, in order.
+        running: The command on which the sandbox works, None if there is none.
+        late_s: Deadline of the running command, infinite after the robot was sent an error for it.
+        release_s: End of the grace period; infinite while the robot is connected.
+        asked_s: When the sandbox was sent the request on which it works; None while it works on no request.
+        snapshots: The snapshot of each stateful service that is in the store (None: there is none).
+        unsaved: The reply of the running command while its snapshot is being stored.
+        idle_since_s: When the sandbox became idle.
+        fault: Why the sandbox is being killed; "" if it is not being killed, or closed its channel itself.
+        is_overrun: Whether the sandbox is killed because its command took too long.
+    """
+
     number: int
     robot: RobotId
     kill_s: float
-    """When it is killed: it did not start, or works too long."""
     state: Literal["starting", "idle", "loading", "restoring", "running", "saving", "dying"] = "starting"
     waiting: deque[SandboxCall] = field(default_factory=deque)
     running: SandboxCall | None = None
     late_s: float = math.inf
-    """Deadline of the running call."""
     release_s: float = math.inf
-    """End of the grace period; infinite while the robot is connected."""
     asked_s: float | None = None
-    """When it was sent what it works at; None while it does nothing."""
     snapshots: dict[str, bytes | None] = field(default_factory=dict)
-    """Last snapshot of each stateful service, as it stands in the store."""
     unsaved: SandboxReply | None = None
-    """The reply whose snapshot is being saved."""
     idle_since_s: float = 0.0
     fault: str = ""
     is_overrun: bool = False
-    """It was killed because the deadline of the running call had passed."""
 
 
 class SandboxPolicy:
-    """All sandboxes of one worker; every event returns the actions that follow from it.
+    """The state of all sandboxes of one worker; an event method returns the actions that follow, in order.
 
-    ``breaker`` knows what is refused after crashes, ``counts`` what happened how often, and ``worked_s`` for
-    how long the sandboxes of each tenant have worked at requests, whatever they answered.
+    All times are monotonic seconds.
+
+    Attributes:
+        breaker: Decides which services and requests are refused after crashes.
+        counts: How often sandboxes were ``created``, were ``released`` (after the grace period, or for
+            another robot), ``crashed`` and ``overran``, and how often a ``poison`` request was refused.
+        worked_s: For each tenant the elapsed seconds for which its sandboxes have worked on requests, with
+            any result.
     """
 
     def __init__(
@@ -205,10 +251,11 @@ class SandboxPolicy:
         """Begin without any sandbox.
 
         Args:
-            kinds: Kind of each installed service.
-            settings: Limits, grace and the rules of the circuit breaker.
-            max_sandboxes: Sandboxes of this worker at a time.
-            keeps_snapshots: Whether there is a store for the state of services.
+            kinds: Kind of each installed service by name: only those of kind ``per_robot_state`` have
+                snapshots.
+            settings: Grace period, and number of crashes that open a circuit breaker.
+            max_sandboxes: Most sandboxes of this worker at a time.
+            keeps_snapshots: Whether there is an object store for snapshots.
         """
         self.counts: Counter[str] = Counter()
         self.worked_s: defaultdict[str, float] = defaultdict(float)
@@ -220,7 +267,7 @@ class SandboxPolicy:
         self._sandboxes: dict[int, _Sandbox] = {}
         self._by_robot: dict[RobotId, _Sandbox] = {}
         self._held_by_tenant: Counter[str] = Counter()
-        self._next_tenant = ""  # gets the next place of a tenant that holds two more
+        self._next_tenant = ""  # the tenant for which the next free place is kept until _next_until_s
         self._next_until_s = -math.inf
         self._connections: Counter[RobotId] = Counter()
         self._last_number = 0
@@ -228,39 +275,43 @@ class SandboxPolicy:
 
     @property
     def held(self) -> int:
-        """Commands that wait or run."""
+        """Number of commands that wait for their sandbox or run in it."""
         return sum(
             len(sandbox.waiting) + (sandbox.running is not None) for sandbox in self._sandboxes.values()
         )
 
     @property
     def sandboxes(self) -> int:
-        """Sandboxes that exist."""
+        """Number of sandboxes that have not been released, including those that start or are being killed."""
         return len(self._sandboxes)
 
     @property
     def wake_s(self) -> float:
-        """The time at which `tick` is due next; infinite if nothing is waited for."""
+        """Monotonic time in seconds at which `tick` must be called next; infinite if no time limit runs."""
         times = (
             min(sandbox.kill_s, sandbox.late_s, sandbox.release_s) for sandbox in self._sandboxes.values()
         )
         return min(times, default=math.inf)
 
     def waiting_of(self, robot: RobotId) -> int:
-        """Return how many commands of *robot* wait."""
+        """Return how many commands of *robot* wait; the running one is not counted."""
         sandbox = self._by_robot.get(robot)
         return 0 if sandbox is None else len(sandbox.waiting)
 
-    # --- events from the gateway -------------------------------------------------------------------
+    # --- events of robots: connections and commands -------------------------------------------------
 
     def add_connection(self, robot: RobotId) -> None:
-        """Count one more connection of *robot*: its sandbox, if it still has one, is not released."""
+        """Count one more connection of *robot*, and end the grace period of its sandbox, if it has one."""
         self._connections[robot] += 1
         if robot in self._by_robot:
             self._by_robot[robot].release_s = math.inf
 
     def remove_connection(self, robot: RobotId, now: float) -> None:
-        """Count one connection of *robot* less; after the last one the grace period of its sandbox begins."""
+        """Count one connection of *robot* less.
+
+        After the last connection, the waiting commands of the robot are dropped without an answer, and the
+        grace period of its sandbox begins.
+        """
         self._connections[robot] -= 1
         if self._connections[robot] > 0:
             return
@@ -271,7 +322,10 @@ class SandboxPolicy:
             sandbox.release_s = now + self._settings.grace_s
 
     def submit(self, call: SandboxCall, now: float) -> list[Action]:
-        """Begin or queue the command of a robot."""
+        """Start the command *call*, let it wait for its robot's sandbox, or answer it with an error.
+
+        The error is that of `CircuitBreaker.refusal`, or Busy if the robot gets no sandbox.
+        """
         refusal = self._refusal(call, now)
         sandbox = self._by_robot.get(call.queued.robot)
         if refusal is None and sandbox is None and not self._gets_place(call.queued.robot, now):
@@ -284,10 +338,10 @@ class SandboxPolicy:
         self._start_next(sandbox, now)
         return self._take_actions()
 
-    # --- events from processes and the store -------------------------------------------------------
+    # --- events of processes, of the object store and of the timer -----------------------------------
 
     def on_ready(self, number: int, now: float) -> list[Action]:
-        """Follow the report that a sandbox has started and takes requests."""
+        """Handle the message of sandbox *number* that it has started and takes requests."""
         sandbox = self._sandboxes.get(number)
         if sandbox is None or sandbox.fault:
             return []
@@ -298,7 +352,12 @@ class SandboxPolicy:
         return self._take_actions()
 
     def on_reply(self, number: int, outcome: SandboxReply | RsePfError, now: float) -> list[Action]:
-        """Follow the answer of a sandbox to its last message; one that is being killed answers too late."""
+        """Handle the answer of sandbox *number* to its last request.
+
+        The answer to a call is passed to the robot; if the snapshot has changed, after the snapshot was
+        stored.  After a successful ``restore``, the call itself is sent; after a failed one, the call is
+        answered by the error.  An answer of a sandbox that is being killed is ignored.
+        """
         sandbox = self._sandboxes.get(number)
         if sandbox is None or sandbox.fault:
             return []
@@ -309,7 +368,7 @@ class SandboxPolicy:
         if sandbox.state == "restoring" and isinstance(outcome, SandboxReply):
             self._send(sandbox, call, now)
         elif sandbox.state == "restoring":
-            del sandbox.snapshots[call.service]  # its state is unknown: the next command restores again
+            del sandbox.snapshots[call.service]  # the service's state is unknown: load the snapshot again
             self._finish(sandbox, call, outcome, now)
         elif (
             isinstance(outcome, RsePfError)
@@ -327,9 +386,16 @@ class SandboxPolicy:
     def on_store_reply(
         self, number: int, call: SandboxCall, outcome: bytes | BaseException | None, now: float
     ) -> list[Action]:
-        """Follow a reply of the store: a snapshot (None if there is none), a saved one (None), or an error.
+        """Handle the result of `LoadSnapshot` or `SaveSnapshot`.
 
-        A Conflict means that it holds a newer snapshot: the robot's state was changed on another server.
+        Args:
+            number: Number of the sandbox.
+            call: The command for which the snapshot was loaded or stored; it is answered by StoreError if
+                *outcome* is an exception.
+            outcome: The loaded snapshot, or None if there is none; None after a snapshot was stored; or the
+                exception.  A Conflict means that another server has stored a newer snapshot: the sandbox is
+                released, and *call* is answered by WorkerLost.
+            now: Monotonic seconds.
         """
         sandbox = self._sandboxes.get(number)
         if sandbox is None or sandbox.running is not call or sandbox.state not in ("loading", "saving"):
@@ -357,26 +423,33 @@ class SandboxPolicy:
         return self._take_actions()
 
     def on_violation(self, number: int, why: str) -> list[Action]:
-        """Kill a sandbox that violated the protocol, or closed its channel (*why* is "")."""
+        """Kill sandbox *number*, because it sent an invalid message (*why*) or closed its channel ("")."""
         sandbox = self._sandboxes.get(number)
         if sandbox is not None and not sandbox.fault:
             self._kill(sandbox, why)
         return self._take_actions()
 
     def on_exit(self, number: int, how: str, now: float) -> list[Action]:
-        """Follow the end of the process of a sandbox."""
+        """Handle the end of the process of sandbox *number*; *how* is the reason in words."""
         if number in self._sandboxes:
             self._release_ended(self._sandboxes[number], how, now)
         return self._take_actions()
 
     def on_all_exited(self, how: str, now: float) -> list[Action]:
-        """Follow the end of all sandboxes with their zygote: it is evidence against no service or request."""
+        """Handle the end of the zygote, with which all sandboxes were killed.
+
+        Commands are retried or answered as after a crash, but `CircuitBreaker` does not count the crashes.
+        """
         for sandbox in list(self._sandboxes.values()):
             self._release_ended(sandbox, how, now, is_evidence=False)
         return self._take_actions()
 
     def tick(self, now: float) -> list[Action]:
-        """Answer the calls whose deadline has passed, and kill and release the sandboxes that are due."""
+        """Apply all time limits that have passed at *now*.
+
+        Sandboxes whose grace period has ended are released, running commands whose deadline has passed are
+        answered by Expired, and sandboxes that did not start or work too long are killed.
+        """
         for sandbox in list(self._sandboxes.values()):
             call = sandbox.running
             if sandbox.release_s <= now:
@@ -388,26 +461,33 @@ class SandboxPolicy:
                 sandbox.late_s = math.inf
                 self._answer(call, Expired("the service did not answer in time", hint=_DEADLINE_HINT))
             if sandbox.kill_s <= now:
-                sandbox.is_overrun = call is not None and not sandbox.fault  # else it is being killed
+                sandbox.is_overrun = (
+                    call is not None and not sandbox.fault
+                )  # a fault: it is being killed already
                 self._kill(sandbox, "it did not start in time" if call is None else "it took too long")
         return self._take_actions()
 
     def close(self) -> list[Action]:
-        """Release every sandbox and answer no command, because the worker ends."""
+        """Release every sandbox without an answer to its commands, because the worker exits."""
         for sandbox in list(self._sandboxes.values()):
             self._release(sandbox)
         return self._take_actions()
 
-    # --- rules -------------------------------------------------------------------------------------
+    # --- rules: refusal, capacity and retry ---------------------------------------------------------
 
     def _refusal(self, call: SandboxCall, now: float) -> RsePfError | None:
+        """Return the error of the circuit breaker for *call*, None if it may run; count poison requests."""
         refusal = self.breaker.refusal(call.queued.robot, call.service, call.digest, now)
         if isinstance(refusal, Poison):
             self.counts["poison"] += 1
         return refusal
 
     def _gets_place(self, robot: RobotId, now: float) -> bool:
-        """Return whether *robot* gets a sandbox; if all places are taken, one may be released for it."""
+        """Return whether *robot* may have a sandbox now; release one for it if all places are taken.
+
+        If no sandbox can be released now, but one of a larger tenant could be while idle, the next free place
+        is kept for the tenant of *robot*.
+        """
         if self._may_create(robot.tenant, now):
             return True
         by_idle = sorted(self._sandboxes.values(), key=lambda sandbox: sandbox.idle_since_s)
@@ -424,7 +504,10 @@ class SandboxPolicy:
         return False
 
     def _in_grace(self) -> RobotId | None:
-        """Return the robot without a connection of the tenant that holds most; None if there is none."""
+        """Return a robot whose sandbox is in its grace period and runs no command; None if there is none.
+
+        Of several robots, the result belongs to the tenant with the most sandboxes.
+        """
         in_grace = (
             sandbox.robot
             for sandbox in self._sandboxes.values()
@@ -433,13 +516,18 @@ class SandboxPolicy:
         return max(in_grace, key=lambda robot: self._held_by_tenant[robot.tenant], default=None)
 
     def _may_create(self, tenant: str, now: float) -> bool:
-        """Return whether a place is free for *tenant*: the last one is kept for the next tenant, if any."""
+        """Return whether a place for a sandbox is free for *tenant*.
+
+        While a place is kept for another tenant, *tenant* cannot have the last free place if it has more
+        sandboxes than that tenant.  If *tenant* is the one that the place is kept for, keeping ends.
+        """
         free = self._max_sandboxes - len(self._sandboxes)
         if tenant == self._next_tenant and free:
             self._next_until_s = -math.inf
         return free > (now < self._next_until_s and self._holds_more(tenant, 1))
 
     def _holds_more(self, tenant: str, more: int) -> bool:
+        """Return whether *tenant* has *more* or more sandboxes above the number of ``_next_tenant``."""
         return self._held_by_tenant[tenant] >= self._held_by_tenant[self._next_tenant] + more
 
     def _no_place_error(self) -> Busy:
@@ -450,6 +538,7 @@ class SandboxPolicy:
         )
 
     def _may_retry(self, call: SandboxCall, sandbox: _Sandbox, now: float) -> bool:
+        """Return whether *call*, during which *sandbox* ended, is repeated in a new sandbox."""
         is_stateless = self._kinds[call.service] == "stateless"
         return (
             not call.is_answered
@@ -460,7 +549,11 @@ class SandboxPolicy:
         )
 
     def _release_ended(self, sandbox: _Sandbox, how: str, now: float, *, is_evidence: bool = True) -> None:
-        """Release a sandbox whose process ended by itself or was killed; retry or answer its command."""
+        """Release a sandbox whose process has ended; log the end, and retry or answer its running command.
+
+        Waiting commands move to a new sandbox; if the sandbox ended before it was ready, they are answered by
+        WorkerLost.  Without *is_evidence*, a crash is not counted by the circuit breaker.
+        """
         call, why = sandbox.running, sandbox.fault or how
         self._count_work(sandbox, now)
         self._release(sandbox)
@@ -484,7 +577,10 @@ class SandboxPolicy:
         self._move_waiting(sandbox, now)
 
     def _move_waiting(self, sandbox: _Sandbox, now: float) -> None:
-        """Move the commands that waited for a released sandbox to a new one."""
+        """Move the commands that wait for the released *sandbox* to a new sandbox of the same robot.
+
+        If no place is free, they are answered by Busy.  If the robot has no connection, nothing is done.
+        """
         if not sandbox.waiting or self._connections[sandbox.robot] == 0:
             return
         if self._may_create(sandbox.robot.tenant, now):
@@ -496,7 +592,7 @@ class SandboxPolicy:
         while sandbox.waiting:
             self._answer(sandbox.waiting.popleft(), self._no_place_error())
 
-    # --- steps -------------------------------------------------------------------------------------
+    # --- transitions of one sandbox, which append the actions ----------------------------------------
 
     def _create(self, robot: RobotId, now: float) -> _Sandbox:
         self._last_number += 1
@@ -516,11 +612,16 @@ class SandboxPolicy:
         sandbox.fault = sandbox.fault or why
         sandbox.kill_s = math.inf
         if sandbox.state == "idle":
-            sandbox.state = "dying"  # a command that comes now waits for the next sandbox
+            sandbox.state = (
+                "dying"  # no longer idle, so a command that arrives now waits for the next sandbox
+            )
         self._actions.append(KillSandbox(sandbox.number))
 
     def _start_next(self, sandbox: _Sandbox, now: float) -> None:
-        """Start the next call of an idle sandbox; refuse those that are no longer worth it."""
+        """Start the next waiting command if *sandbox* is idle.
+
+        Commands that the circuit breaker refuses, or whose deadline has passed, are answered by an error.
+        """
         while sandbox.state == "idle" and not sandbox.fault and sandbox.waiting:
             call = sandbox.waiting.popleft()
             queued, refusal = call.queued, self._refusal(call, now)
@@ -545,6 +646,7 @@ class SandboxPolicy:
             self._actions.append(SendMessage(sandbox.number, call.data))
 
     def _count_work(self, sandbox: _Sandbox, now: float) -> None:
+        """Add the time from the last request of *sandbox* to *now* to ``worked_s``; its work ends now."""
         if sandbox.asked_s is not None:
             self.worked_s[sandbox.robot.tenant] += now - sandbox.asked_s
             sandbox.asked_s = None
@@ -552,6 +654,11 @@ class SandboxPolicy:
     def _finish(
         self, sandbox: _Sandbox, call: SandboxCall, outcome: SandboxReply | RsePfError, now: float
     ) -> None:
+        """Answer *call* with *outcome*, and start the next waiting command of its *sandbox*.
+
+        If the place of the sandbox is needed for the tenant that waits for one, the sandbox is released
+        instead, and its waiting commands are answered by Busy.
+        """
         sandbox.state, sandbox.running, sandbox.unsaved = "idle", None, None
         sandbox.late_s = sandbox.kill_s = math.inf
         sandbox.idle_since_s = now

@@ -1,9 +1,11 @@
-"""The sandboxes of a worker whose services may be replaced while robots are connected.
+"""Replace the installed services of a worker by another set while robots are connected.
 
-A replacement gets a zygote and sandboxes of its own.  It takes new commands once its zygote is ready and the
-isolation is complete; until then, and if that fails, the former ones go on.  The commands of one robot keep
-their order: one that arrives while an earlier one is with the former sandboxes waits for its answer.  State
-that a snapshot holds moves with the robot.
+Each set of services is a generation, with a zygote and sandboxes of its own.  New commands go to the next
+generation as soon as its zygote is ready, and no means of isolation is missing (unless the settings accept
+that); until then, and if that fails,
+the current generation continues.  The commands of one robot keep their order: a command that arrives while an
+earlier one of its robot runs in a former generation waits for that one's answer.  State that is in a snapshot
+is restored in the next generation.
 """
 
 from __future__ import annotations
@@ -26,16 +28,28 @@ from rse_pf.wire import Failure, Result
 __all__ = ["Answer", "MakeSandboxes", "OnReady", "ReloadingSandboxes"]
 
 Answer = Callable[[QueuedCommand, Result | Failure], None]
+"""Called with a command and its answer."""
 OnReady = Callable[[tuple[str, ...] | None], None]
+"""Called when a zygote is ready, with the missing means of isolation, or with None when it has exited."""
 
 
 MakeSandboxes = Callable[..., SandboxManager]
-"""Makes the sandboxes of some services; blocks until they are ready unless *on_ready* is given."""
+"""Makes and starts a `SandboxManager` for its argument, a sequence of `InstalledService`.
+
+The keywords are ``answer`` (`Answer`) and ``on_ready`` (`OnReady` or None); with None, the call blocks until
+the zygote is ready.
+"""
 
 
 @dataclass(eq=False, slots=True)
 class _Generation:
-    """The services of one time, and how many commands of each robot have no answer yet."""
+    """A set of services and their sandboxes.
+
+    Attributes:
+        names: Names of the services.
+        sandboxes: The sandboxes; None without services, or after their zygote has exited.
+        unanswered: Number of commands without an answer, by robot.
+    """
 
     names: tuple[str, ...]
     sandboxes: SandboxManager | None = None
@@ -43,7 +57,7 @@ class _Generation:
 
 
 class ReloadingSandboxes(CommandQueue):
-    """The queue of installed services: what the dispatcher knows of the sandboxes of its worker."""
+    """The command queue of a worker's installed services, which can be replaced while commands run."""
 
     def __init__(
         self,
@@ -54,14 +68,15 @@ class ReloadingSandboxes(CommandQueue):
         host: SandboxHost,
         on_change: Callable[[tuple[str, ...]], None],
     ) -> None:
-        """Run nothing yet.
+        """Begin without services.
 
         Args:
-            make: Makes and starts the sandboxes.
-            accepts_weak_isolation: ``services.accept_weak_isolation``.
-            start_timeout_s: A replacement that is not ready after this is given up.
-            host: The worker.
-            on_change: Called with the names of the services that run from now on.
+            make: Makes and starts the sandboxes of a generation.
+            accepts_weak_isolation: Setting ``services.accept_weak_isolation``: whether services run if a
+                means of isolation is missing.
+            start_timeout_s: Seconds after which a replacement whose zygote is not ready is given up.
+            host: Event loop, clock, log and answers of the worker.
+            on_change: Called with the names of the new services after each replacement.
         """
         self._make = make
         self._accepts_weak_isolation = accepts_weak_isolation
@@ -72,20 +87,24 @@ class ReloadingSandboxes(CommandQueue):
         self._answer = host.answer
         self._on_change = on_change
         self._connections: Counter[RobotId] = Counter()
-        self._waiting: dict[RobotId, deque[QueuedCommand]] = {}
-        self._retiring: list[_Generation] = []
-        self._next: _Generation | None = None
+        self._waiting: dict[RobotId, deque[QueuedCommand]] = {}  # for answers of former generations
+        self._retiring: list[
+            _Generation
+        ] = []  # former generations that still have commands without an answer
+        self._next: _Generation | None = None  # the replacement whose zygote is not ready yet
         self._give_up: TimerHandle | None = None
         self._past_s: defaultdict[str, float] = defaultdict(float)
+        """Working seconds by tenant in generations that have ended."""
         self._past: Counter[str] = Counter()
-        """Counts of sandboxes that have ended."""
+        """`SandboxPolicy.counts` of generations that have ended."""
         self._current = _Generation(())
 
     def start(self, services: Sequence[InstalledService]) -> None:
-        """Run *services*, and wait until they are ready; without any, start no process.
+        """Run the first *services*, and block until their zygote is ready; with none, start no process.
 
         Raises:
-            ConfigurationError: A means of isolation is missing and weak isolation was not accepted.
+            ConfigurationError: The zygote did not start, or a means of isolation is missing and weak
+                isolation is not accepted.
         """
         first = _Generation(tuple(service.name for service in services))
         if services:
@@ -94,13 +113,18 @@ class ReloadingSandboxes(CommandQueue):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the services that run."""
+        """Names of the services of the current generation."""
         return self._current.names
 
-    # --- replacement ---------------------------------------------------------------------------------
+    # --- replacement of a generation by the next one -------------------------------------------------
 
     def replace(self, services: Sequence[InstalledService]) -> None:
-        """Run *services* instead as soon as they are ready; a replacement that is not yet is dropped."""
+        """Replace the current services by *services* as soon as their zygote is ready; does not block.
+
+        An earlier replacement that is not ready yet is dropped.  If the zygote does not start in time, or a
+        means of isolation is missing and that is not accepted, the current services continue, and the error
+        event ``services-refused`` is logged.
+        """
         self._drop_next()
         fresh = _Generation(tuple(service.name for service in services))
         if not services:
@@ -158,7 +182,10 @@ class ReloadingSandboxes(CommandQueue):
         self._on_change(fresh.names)
 
     def _end_if_idle(self, former: _Generation) -> None:
-        """End sandboxes that have answered everything; each command is answered at its deadline at last."""
+        """End the sandboxes of a former generation if all its commands are answered, and add up its counts.
+
+        This happens at the latest at the last deadline, at which every command is answered.
+        """
         if former in self._retiring and not former.unanswered and former.sandboxes is not None:
             self._retiring.remove(former)
             self._past.update(former.sandboxes.report()["counts"])
@@ -166,15 +193,18 @@ class ReloadingSandboxes(CommandQueue):
                 self._past_s[tenant] += worked_s
             former.sandboxes.retire()
 
-    # --- commands ------------------------------------------------------------------------------------
+    # --- commands of robots --------------------------------------------------------------------------
 
     def offers(self, service: str) -> bool:
-        """Return whether *service* is one of those that run."""
+        """Return whether *service* is the name of a service of the current generation."""
         return service in self._current.names
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Run *queued* in its robot's sandbox; the answer comes through the callback."""
-        if self._is_held(queued.robot):
+        """Run *queued* in the sandbox of its robot; the answer is passed to `SandboxHost.answer`.
+
+        The command waits first while a former generation works on an earlier command of the robot.
+        """
+        if self._must_wait(queued.robot):
             self._waiting.setdefault(queued.robot, deque()).append(queued)
         else:
             self._run(queued)
@@ -196,32 +226,36 @@ class ReloadingSandboxes(CommandQueue):
             del generation.unanswered[robot]
         self._answer(queued, message)
         if generation is not self._current:
-            self._loop.call_soon(self._go_on, robot)
+            self._loop.call_soon(self._run_waiting, robot)
             self._loop.call_soon(self._end_if_idle, generation)
 
-    def _is_held(self, robot: RobotId) -> bool:
+    def _must_wait(self, robot: RobotId) -> bool:
+        """Return whether a new command of *robot* waits for answers of former generations."""
         return robot in self._waiting or any(robot in generation.unanswered for generation in self._retiring)
 
-    def _go_on(self, robot: RobotId) -> None:
-        """Run what waited for the former sandboxes of *robot*."""
+    def _run_waiting(self, robot: RobotId) -> None:
+        """Run the waiting commands of *robot*, unless former generations have not answered all others."""
         if any(robot in generation.unanswered for generation in self._retiring):
             return
         for queued in self._waiting.pop(robot, ()):
             self._run(queued)
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """Do nothing: the command is answered before its deadline."""
+        """Do nothing: a sandbox cannot cancel a command, which is answered at its deadline at the latest."""
 
-    # --- robots --------------------------------------------------------------------------------------
+    # --- connections of robots -----------------------------------------------------------------------
 
     def enter(self, owner: Any) -> None:
-        """Note a connection, whose robot keeps its sandbox."""
+        """Count the connection *owner*; the sandbox of its robot is kept while the robot has connections."""
         self._connections[owner.robot] += 1
         for sandboxes in self._all:
             sandboxes.add_connection(owner.robot)
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
-        """Note the end of a connection; nobody waits for the commands of a robot that has none."""
+        """Count the connection *owner* no more; after the last one of its robot, drop the robot's commands.
+
+        Dropped commands are not answered.  The result is always empty: no command is left to the caller.
+        """
         robot = owner.robot
         self._connections[robot] -= 1
         is_gone = self._connections[robot] <= 0
@@ -237,7 +271,7 @@ class ReloadingSandboxes(CommandQueue):
         return []
 
     def close(self) -> None:
-        """End every sandbox and the zygotes."""
+        """Kill the sandboxes of all generations, and wait until their zygotes have exited."""
         self._drop_next()
         for sandboxes in self._all:
             sandboxes.close()
@@ -247,21 +281,24 @@ class ReloadingSandboxes(CommandQueue):
         managers = (generation.sandboxes for generation in (self._current, *self._retiring))
         return [manager for manager in managers if manager is not None]
 
-    # --- what is shown -------------------------------------------------------------------------------
+    # --- state for robots, metrics and operators -----------------------------------------------------
 
     @property
     def held(self) -> int:
-        """Commands that wait or run."""
+        """Number of commands that wait or run, in all generations."""
         return sum(manager.held for manager in self._all) + sum(map(len, self._waiting.values()))
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return how many commands of the robot wait."""
+        """Return how many commands of the robot of *queued* wait; the robot never has to pause."""
         robot = queued.robot
         here = len(self._waiting.get(robot, ()))
         return QueueBacklog(here + sum(manager.waiting_of(robot) for manager in self._all))
 
     def report(self) -> QueueReport:
-        """Return the state and the counts of this worker's sandboxes for /readyz and /metrics."""
+        """Return state and counts of the sandboxes of all generations for ``/readyz`` and ``/metrics``.
+
+        Missing isolation and open circuit breakers are those of the current generation.
+        """
         reports = [manager.report() for manager in self._all]
         counts = Counter(self._past)
         for report in reports:
@@ -287,11 +324,11 @@ class ReloadingSandboxes(CommandQueue):
         )
 
     def blocks(self) -> list[Block]:
-        """Return the services and requests that are refused now after crashes, with their robots."""
+        """Return the refusals of the current generation that are in force after crashes or overruns."""
         current = self._current.sandboxes
         return [] if current is None else current.blocks()
 
     def unblock(self, service: str | None, tenant: str | None, robot: str | None) -> list[Block]:
-        """Lift what is refused (None stands for all), and return what it was."""
+        """Lift the refusals that match all arguments (None matches everything), and return them."""
         current = self._current.sandboxes
         return [] if current is None else current.unblock(service, tenant, robot)

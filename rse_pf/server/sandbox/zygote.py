@@ -1,7 +1,8 @@
-"""The fork server (zygote) of sandboxes, started by a worker.
+"""The zygote: the fork server from which a worker starts its sandboxes.
 
-It imports the modules that services need, so that a forked sandbox starts without imports.  It has no thread
-and no event loop, runs no service itself, and exits with its worker, together with every sandbox.
+The zygote imports the modules that services need, so that a forked sandbox starts without imports.  It has
+one thread and no event loop, and runs no code of services.  It exits when its worker has exited, after it has
+killed every sandbox.
 """
 
 from __future__ import annotations
@@ -26,14 +27,17 @@ from rse_pf.services.custom.verified_copy import PrivateFolder, VerifiedCopy
 
 __all__ = ["run"]
 
-_GO = b"g"
-_SLOTS = 500  # user ids of one zygote; those of the next one follow
-_FIRST_UID = 1_000_000  # sandboxes of a server that runs as root get user ids from here, unused by accounts
-_MAX_THREADS = 64  # threads of one sandbox, so that a service cannot exhaust the process ids of the machine
+_GO = b"g"  # byte that a forked sandbox waits for before it isolates itself
+_SLOTS = 500  # number of user ids of one zygote, so that the user ids of two zygotes never overlap
+_FIRST_UID = 1_000_000  # lowest user id of sandboxes of a server that runs as root; accounts have lower ones
+_MAX_THREADS = 64  # most threads of one sandbox, so that a service cannot exhaust the machine's process ids
 
 
 def run(worker: socket.socket) -> None:
-    """Fork sandboxes until the worker has exited."""
+    """Read the configuration from the socket to the *worker*, and fork sandboxes until the worker has exited.
+
+    Then the process exits.  It returns at once if the worker exits before it sends a configuration.
+    """
     config, _ = read_packet(worker)
     if config is not None:
         _Zygote(config).run(worker)
@@ -59,7 +63,7 @@ class _Zygote:
         readable = readable_paths([service for service in services.values() if not service.identity])
         copies = self._places()
         missing = self._missing_isolation(readable, copies, config["scratch_bytes"])
-        if "root" in missing and self._private.path is not None:  # a sandbox sees the copies where they are
+        if "root" in missing and self._private.path is not None:  # sandboxes read the copies in place
             self._private.path.chmod(0o755)
             services |= {name: copy.service for name, copy in self._copies.items()}
         self._plan = SandboxPlan(
@@ -79,11 +83,12 @@ class _Zygote:
         has_cgroup = "memory" in self._cgroups.controllers
         self._watch = None if has_cgroup else MemoryWatcher(total_bytes).look
         self._slots: dict[int, int] = {}
-        """User id of each sandbox, by number."""
+        """Slot of each sandbox, by number of the sandbox: its user id minus that of slot 0."""
         self._starts: dict[int, int] = {}
-        """Pipes on which sandboxes wait until their process id is known, by number."""
+        """Pipe to each sandbox that waits for `_GO`, by number of the sandbox."""
 
     def run(self, worker: socket.socket) -> None:
+        """Serve the orders of *worker* until it has exited; remove cgroups and copies, and exit."""
         plan = ForkPlan(fork=self._fork, begin=self._begin, free=self._free, watch=self._watch)
         serve_forks(worker, plan, missing=list(self._plan.missing), cgroup=list(self._cgroups.controllers))
         self._cgroups.close()
@@ -91,7 +96,10 @@ class _Zygote:
         os._exit(0)
 
     def _copy(self, installed: list[InstalledService]) -> None:
-        """Copy and compare *installed*; what was changed since the worker looked is refused."""
+        """Make a verified copy of each service in *installed*, for all sandboxes.
+
+        A service whose files were changed since the server verified them is refused: each call of it fails.
+        """
         for service in installed:
             copy = VerifiedCopy(service, self._private.path or self._private.make())
             try:
@@ -101,7 +109,7 @@ class _Zygote:
                 self._refused[service.name] = error
 
     def _places(self) -> dict[Path, Path]:
-        """Return the folders of installed services and of their packages, and the copies of both."""
+        """Return the folder of the copy for each folder of an installed service, and of its packages."""
         places = {}
         for copy in self._copies.values():
             places[copy.original.folder] = copy.service.folder
@@ -110,13 +118,21 @@ class _Zygote:
         return places
 
     def _plan_of_now(self) -> SandboxPlan:
-        """Return the plan of a sandbox that starts now: a service that somebody edited is refused."""
+        """Return the plan of a sandbox that starts now, which refuses services whose files were edited."""
         problems = {name: copy.problem() for name, copy in self._copies.items()}
         edited = {name: error for name, error in problems.items() if error is not None}
         return replace(self._plan, refused={**self._refused, **edited})
 
     def _fork(self, number: int, descriptors: list[int]) -> int:
-        """Fork twice: the first child enters the namespaces, the second is the first process inside them."""
+        """Fork sandbox *number* and return its process id, 0 if that failed; the sandbox waits for `_begin`.
+
+        A first child enters the namespaces and forks the sandbox, because only a child of the process that
+        made a namespace of processes is in it.
+
+        Args:
+            number: Number of the sandbox.
+            descriptors: Socket to the worker, and pipe for printed output.
+        """
         channel, output = descriptors
         used = set(self._slots.values())
         self._slots[number] = next(n for n in range(_SLOTS) if n not in used)
@@ -141,31 +157,37 @@ class _Zygote:
         return pid
 
     def _begin(self, number: int, pid: int) -> str:
-        """Let a sandbox isolate itself; moving it into its cgroup takes about 10 ms of that time."""
+        """Let sandbox *number* isolate itself, and move its process into a cgroup meanwhile (about 10 ms).
+
+        Returns:
+            "", or the reason to kill the sandbox: it could not enter its cgroup.
+        """
         go = self._starts.pop(number)
         os.write(go, _GO)
         os.close(go)
         return "" if self._cgroups.add(number, pid) else "it could not enter its cgroup"
 
     def _free(self, number: int) -> str:
+        """Free user id and cgroup of the exited sandbox *number*; return the limit that ended it, or ""."""
         del self._slots[number]
         return self._cgroups.remove(number) or ""
 
     def _fork_inside(
         self, plan: SandboxPlan, channel: int, output: int, uid: int | None, pid_write: int, go_read: int
     ) -> None:
-        """Enter the namespaces, fork the sandbox, report its process id and exit.
+        """Enter the namespaces, fork the sandbox, write its process id to *pid_write* and exit.
 
-        A session of its own: Linux shares the processor between sessions (`sched_autogroup_enabled`), so that
-        the threads of a sandbox weigh no more than one.  And a stopped process in the server's process group
-        would have Linux end that group with SIGHUP when the parent of the group ends.
+        The sandbox is in a session of its own for two reasons.  Linux divides CPU time between sessions
+        (``sched_autogroup_enabled``), so that a sandbox with many threads gets no more than one with a single
+        thread.  And Linux sends SIGHUP to a process group that has a stopped process and loses its parent: a
+        paused sandbox in the server's group would end the server.
         """
         try:
             os.setsid()
             if "namespaces" not in plan.missing:
                 isolation.enter_namespaces()
             pid = os.fork()
-            if pid == 0 and os.read(go_read, 1) == _GO:  # the zygote knows the pid
+            if pid == 0 and os.read(go_read, 1) == _GO:  # `_begin` wrote it; the zygote knows the process id
                 run_sandbox(plan, channel, output, uid)
             elif pid:
                 os.write(pid_write, str(pid).encode())
@@ -175,6 +197,7 @@ class _Zygote:
     def _missing_isolation(
         self, readable: list[Path], copies: Mapping[Path, Path], scratch_bytes: int
     ) -> list[str]:
+        """Return the names of `isolation.ISOLATION` that this machine lacks, by a try of each means."""
         uid = self._first_uid
 
         def make_root() -> None:
@@ -192,7 +215,7 @@ class _Zygote:
 
 
 def _warm_up(languages: set[str]) -> None:
-    """Import what every sandbox would import otherwise."""
+    """Import the modules that services in *languages* need, so that sandboxes do not import them again."""
     importlib.import_module("numpy.linalg")
 
     if "cpp" in languages:
@@ -200,5 +223,5 @@ def _warm_up(languages: set[str]) -> None:
     if "lua" in languages:
         from rse_pf.services.custom.lua import warm_up
 
-        with contextlib.suppress(MissingExtra):  # reported when a robot calls the service
+        with contextlib.suppress(MissingExtra):  # Lua is not installed: the call of a Lua service reports it
             warm_up()

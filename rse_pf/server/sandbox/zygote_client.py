@@ -1,6 +1,8 @@
-"""Control the `zygote` from its worker: start it, order sandboxes, and get reports of their ends.
+"""Control the `zygote` from its worker: start it, order sandboxes, and receive reports of their ends.
 
-Only the first start blocks; orders to a zygote that is restarted wait in its channel.
+The event loop is blocked only by `ZygoteClient.start`, until the zygote is ready, and by `ZygoteClient.close`
+for up to 0.5 s.  A zygote that exits unexpectedly is replaced at once; orders that are sent to the new one
+before it is ready wait in its socket.
 """
 
 from __future__ import annotations
@@ -22,12 +24,16 @@ from rse_pf.services.custom.installed import InstalledService
 
 __all__ = ["ZygoteClient"]
 
-SCRATCH_BYTES = 1 << 24  # scratch folder of one sandbox, in its memory; it has one inode for 4,096 bytes
-_END_S = 0.5  # a zygote has this long to end its sandboxes before it is killed
+SCRATCH_BYTES = 1 << 24  # size of the scratch folder of one sandbox in bytes, a part of its memory limit
+_END_S = 0.5  # seconds within which a zygote must kill its sandboxes and exit; after that it is killed
 
 
 class ZygoteClient:
-    """The zygote of one worker; ``missing`` names the means of isolation that this machine lacks."""
+    """The zygote of one worker.
+
+    Attributes:
+        missing: Names of `isolation.ISOLATION` that this machine lacks; empty before the zygote is ready.
+    """
 
     def __init__(
         self,
@@ -40,17 +46,20 @@ class ZygoteClient:
         on_lost: Callable[[], None],
         on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
-        """Describe the zygote; `start` starts it.
+        """Prepare; `start` starts the zygote.
 
         Args:
             services: Services that sandboxes may load.
-            settings: Limits of sandboxes.
+            settings: Limits of sandboxes, ``services.accept_weak_isolation``, and the time limit of the start
+                (``local.start_timeout_s``).
             loop: Event loop of the worker.
             log: Log of the worker.
-            on_gone: Called with the number of a sandbox that ended, and how it ended.
-            on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting.
-            on_ready: If given, `start` does not block: it is called once, with the means of isolation that
-                are missing, or with None if the zygote ended before.  The caller decides whether to go on.
+            on_gone: Called with the number of a sandbox whose process has ended, and the reason in words.
+            on_lost: Called when the zygote has exited unexpectedly, and every sandbox with it; a new zygote
+                is starting.
+            on_ready: If given, `start` does not block.  The function is called once: with the missing means
+                of isolation when the zygote is ready, or with None if it has exited before.  The caller then
+                decides whether the sandboxes are used; a zygote that has exited is not replaced.
         """
         self._services = services
         self._settings = settings
@@ -58,8 +67,8 @@ class ZygoteClient:
         self._log = log
         self._on_gone, self._on_lost = on_gone, on_lost
         self._handles: dict[int, int] = {}
-        """Descriptors of the processes of sandboxes, by number."""
-        self._paused: set[int] = set()
+        """Descriptor of the process (pidfd) of each sandbox, by number of the sandbox."""
+        self._paused: set[int] = set()  # numbers of the sandboxes that are, or will be, stopped by SIGSTOP
         self._on_ready = on_ready
         self.missing: tuple[str, ...] = ()
 
@@ -67,8 +76,8 @@ class ZygoteClient:
         """Start the zygote, and wait until it is ready unless *on_ready* was given.
 
         Raises:
-            ConfigurationError: It did not start, or a means of isolation is missing and weak isolation
-                was not accepted.
+            ConfigurationError: The zygote did not start, or a means of isolation is missing and weak
+                isolation is not accepted; only without *on_ready*.
         """
         self._launch()
         if self._on_ready is None:
@@ -76,7 +85,16 @@ class ZygoteClient:
         self._listen()
 
     def create(self, number: int, channel: socket.socket, output: int) -> bool:
-        """Order sandbox *number* with its descriptors; return False if too many orders wait."""
+        """Order the zygote to start sandbox *number*.
+
+        Args:
+            number: Number of the sandbox.
+            channel: The sandbox's end of the socket for messages.
+            output: Descriptor to which the sandbox prints.
+
+        Returns:
+            False if the order could not be sent, because too many orders wait or the zygote has exited.
+        """
         try:
             send_order(self._process, "create", number, channel.fileno(), output)
         except OSError:
@@ -84,35 +102,41 @@ class ZygoteClient:
         return True
 
     def end(self, number: int) -> None:
-        """Order that sandbox *number* is killed; it is no error if it has ended already."""
+        """Order the zygote to kill sandbox *number*; does nothing if the sandbox has ended already."""
         with contextlib.suppress(OSError):
             send_order(self._process, "end", number)
 
     def pause(self, number: int) -> None:
-        """Stop every thread of sandbox *number* until `resume`; it may still be starting."""
+        """Stop all threads of sandbox *number* by SIGSTOP until `resume`.
+
+        A sandbox whose process the zygote has not reported yet is stopped when it is reported.
+        """
         self._paused.add(number)
         self._signal(number, signal.SIGSTOP)
 
     def resume(self, number: int) -> None:
-        """Resume sandbox *number*; one that is not paused is no error."""
+        """Continue sandbox *number* by SIGCONT; does nothing if it is not paused."""
         if number in self._paused:
             self._paused.discard(number)
             self._signal(number, signal.SIGCONT)
 
     def close(self) -> None:
-        """End the zygote, and with it every sandbox."""
+        """End the zygote, which kills every sandbox; waits up to 0.5 s, then kills the zygote."""
         self._loop.remove_reader(self._channel.fileno())
         self._stop()
 
     def retire(self) -> None:
-        """End the zygote and every sandbox without waiting for it."""
+        """End the zygote, which kills every sandbox; a thread waits for it and kills it after 0.5 s."""
         self._loop.remove_reader(self._channel.fileno())
         self._channel.close()
         self._forget_all()
         self._loop.run_in_executor(None, self._process.end, _END_S)
 
     def _signal(self, number: int, which: signal.Signals) -> None:
-        """Send a signal; a descriptor never means another process, as a reused process id could."""
+        """Send the signal *which* to the process of sandbox *number*, if that is known and has not ended.
+
+        A pidfd is used because a process id may belong to another process by now.
+        """
         if number in self._handles:
             with contextlib.suppress(ProcessLookupError):  # it has ended, which the zygote reports
                 signal.pidfd_send_signal(self._handles[number], which)
@@ -133,10 +157,12 @@ class ZygoteClient:
             "total_bytes": limits.memory_bytes,
             "max_bytes": self._settings.session.max_inflated_bytes,
         }  # fmt: skip
-        # No credentials, and no threads of the linear algebra library: it will be forked.  Each arena of the
-        # allocator takes 64 MiB of address space, which is limited; with one for each thread, 7 threads fit.
-        # Nothing is imported from the folder in which the server was started: it may contain a service of
-        # somebody else.
+        # These are all environment variables of the zygote, so it gets no credentials.
+        # One thread of linear algebra: a process with threads cannot be forked safely.
+        # Two arenas of the allocator: each takes 64 MiB of address space, which is limited, so that with one
+        # arena for each thread only 7 threads would fit.
+        # Safe path: no module is imported from the folder in which the server was started, which may contain
+        # files of other users.
         variables = {
             "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1",
             "MALLOC_ARENA_MAX": "2", "PYTHONSAFEPATH": "1",
@@ -146,6 +172,7 @@ class ZygoteClient:
         self._channel = self._process.connection
 
     def _wait_until_ready(self) -> tuple[str, ...]:
+        """Block until the zygote is ready, and return the missing means of isolation; raises as `start`."""
         self._channel.settimeout(self._settings.local.start_timeout_s)
         try:
             report, _ = read_packet(self._channel)
@@ -171,6 +198,7 @@ class ZygoteClient:
         self._loop.add_reader(self._channel.fileno(), self._read_reports)
 
     def _read_reports(self) -> None:
+        """Handle all reports of the zygote that have arrived; replace the zygote if it has exited."""
         while True:
             try:
                 report, handles = read_packet(self._channel)
@@ -180,7 +208,7 @@ class ZygoteClient:
                 self._loop.remove_reader(self._channel.fileno())
                 self._stop()
                 self._log.error("zygote-lost")
-                if self._tell_ready(None):
+                if self._report_readiness(None):
                     return
                 self._launch()
                 self._listen()
@@ -189,15 +217,15 @@ class ZygoteClient:
             if report["event"] == "ready":
                 self._log.info("sandbox-limits", cgroup=", ".join(report["cgroup"]))
                 self.missing = tuple(report["missing"])
-                self._tell_ready(self.missing)
+                self._report_readiness(self.missing)
             elif report["event"] == "created":
                 self._on_created(report["id"], *handles)
             elif report["event"] == "gone":
                 self._forget(report["id"])
                 self._on_gone(report["id"], report["how"])
 
-    def _tell_ready(self, missing: tuple[str, ...] | None) -> bool:
-        """Call `on_ready` once, outside of this call; return whether there was one."""
+    def _report_readiness(self, missing: tuple[str, ...] | None) -> bool:
+        """Let the event loop call *on_ready* with *missing*; return False if there is none, or it was used."""
         on_ready, self._on_ready = self._on_ready, None
         if on_ready is not None:
             self._loop.call_soon(on_ready, missing)
@@ -214,7 +242,10 @@ class ZygoteClient:
             os.close(self._handles.pop(number))
 
     def _stop(self) -> None:
-        """End the zygote: it ends its sandboxes and removes their cgroups when the channel is closed."""
+        """Close the socket to the zygote, which then kills its sandboxes, removes their cgroups and exits.
+
+        Waits up to 0.5 s for its exit, then kills it.
+        """
         self._process.end(_END_S)
         self._forget_all()
 
