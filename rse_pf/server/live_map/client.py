@@ -32,10 +32,11 @@ from rse_pf.wire.live_map import LiveRequest
 __all__ = ["LiveMapClient"]
 
 _STORE_THREADS = 4
-"""Number of threads in which a worker reads leases of live maps: as many leases are read at the same time."""
+"""Number of threads in which a worker waits for the object store, so that it reads the leases of up to four
+live maps at the same time."""
 _RELEASE_TIMEOUT_S = 5.0
-"""Seconds for which a worker that ends waits until its map servers have released their maps; after that time
-it ends all the same, and Linux kills them."""
+"""Seconds for which a worker that shuts down waits until its map servers have released their maps; after that
+time the worker exits, and Linux kills these map servers."""
 _LISTED_STATES = {"serving": "live", "starting": "moving", "released": "idle", "stopped": "stopped"}
 """State of a map in the reply of ``live-list``, for each state of its lease: ``live`` while a map server
 answers requests, ``moving`` while a map server restores the map, ``idle`` without a map server, ``stopped``
@@ -59,7 +60,7 @@ class LiveMapClient:
         on_update: Callable[[str, str, dict[str, Any]], None],
         implementation: str = DEFAULT_IMPLEMENTATION,
     ) -> None:
-        """Prepare; nothing is read or started before the first request or subscriber.
+        """Prepare; no lease is read and no process is started before the first request or subscriber.
 
         Args:
             store: Object store that all servers share.
@@ -124,9 +125,11 @@ class LiveMapClient:
         return await connection.request(robot, operation, request, deadline_s)
 
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
-        """Return name, state, owner and server of each live map of *tenant*, as its lease in the store says.
+        """Return the fields of ``live-list`` for each live map of *tenant*, from its lease in the store.
 
-        A map whose server has died keeps its last state.
+        ``name`` is the name of the map, ``state`` one of the values of `_LISTED_STATES`, ``owner`` the name
+        of the map server's process, and ``server`` the id of its backend server.  The state of a map whose
+        map server was killed does not change until another process claims the map.
 
         Raises:
             StoreError: The store fails, or a lease is damaged.
@@ -135,9 +138,10 @@ class LiveMapClient:
         return listed
 
     def watch(self, tenant: str, map_name: str, *, may_start: bool = True) -> None:
-        """Begin the updates of a map.  After each connection to a map server, all its updates are sent first.
+        """Let *on_update* be called with each update of a map from now on.
 
-        A further call for the same map only replaces *may_start*.
+        After each new connection to the map server, the newest update of each key comes first.  A further
+        call for the same map only replaces *may_start*.
 
         Args:
             tenant: Tenant of the map.
@@ -151,16 +155,16 @@ class LiveMapClient:
         self._update_spare()
 
     def unwatch(self, tenant: str, map_name: str) -> None:
-        """End the updates of a live map for this worker; does nothing if the worker does not use the map."""
+        """Receive no more updates of a live map; does nothing if this worker does not use the map."""
         connection = self._connections.get((tenant, map_name))
         if connection is not None:
             connection.set_watched(False)
             self._update_spare()
 
     def give_up(self) -> None:
-        """Order the map servers of this worker to give their maps up, because the server drains.
+        """Order the map servers of this worker to release their maps, because the server drains.
 
-        No map server is started any more.
+        From now on, this worker starts no map server.  Returns before the maps are released.
         """
         self._pool.release_all()
 

@@ -35,7 +35,7 @@ _RENEWALS_PER_LEASE = 3
 """Number of renewals of a lease within ``live.lease_s``: one renewal may fail, and the next one still comes
 before the lease expires."""
 _FAILED_STARTS_BEFORE_BACKOFF = 2
-"""Number of takeovers in a row (`LeaseRecord.tries`) up to which a map server that died is replaced
+"""Number of takeovers in a row (`LeaseRecord.tries`) up to which a failed map server is replaced
 ``live.lease_s`` after its last renewal; each takeover beyond this number doubles the wait."""
 _MAX_TAKEOVER_WAIT_S = 60.0
 """Longest wait in seconds before the takeover of a map whose map servers fail again and again, unless
@@ -62,7 +62,7 @@ class LeaseRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
         beat: Number of renewals by this map server.
         base: Position in the log at which a map of this name was stopped last; a later map of the same name
             begins with the next entry.  0 if no map of this name was stopped.
-        tries: Number of takeovers in a row from a map server that died; 0 again when a map server has renewed
+        tries: Number of takeovers in a row from a failed map server; 0 again when a map server has renewed
             the lease with ``is_settled``, or has given the map up.
     """
 
@@ -134,14 +134,14 @@ def next_action(record: LeaseRecord | None, *, unchanged_s: float, lease_s: floa
     Args:
         record: The lease as it is stored; None if the map has no lease.
         unchanged_s: Seconds for which the calling process has seen no renewal, by its own clock.
-        lease_s: Seconds without a renewal after which the map server counts as dead.
+        lease_s: Seconds without a renewal after which the map server counts as failed.
 
     Returns:
-        ``claim``: become the map server, since there is none, or it gave the map up, or it is dead.  If
-        ``record.tries`` is 3, 4, 5, ..., since map servers failed soon after their start, a dead one is
+        ``claim``: become the map server, since there is none, or it gave the map up, or it has failed.  If
+        ``record.tries`` is 3, 4, 5, ..., since map servers failed soon after their start, a failed one is
         replaced only after *lease_s* times 2, 4, 8, ..., at most 60 s (exponential back-off).
         ``connect``: the map server accepts connections.
-        ``wait``: a map server is starting, or is dead and may not be replaced yet.
+        ``wait``: a map server is starting, or has failed and may not be replaced yet.
     """
     if record is None or record.state in ("released", "stopped"):
         return "claim"
@@ -263,6 +263,7 @@ class MapLease:
         return self._write_if_held(msgspec.structs.replace(self.record, state="stopped", base=base, tries=0))
 
     def _write_if_held(self, record: LeaseRecord) -> bool:
+        """Replace the lease by *record*; return False if another process has taken or changed the lease."""
         return self._is_held and self._write(record)
 
     def _write(self, record: LeaseRecord) -> bool:

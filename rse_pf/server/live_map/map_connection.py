@@ -1,9 +1,9 @@
 """Connect one worker to the map server of one live map; start or replace the map server if necessary.
 
 A worker finds the map server of a map by the lease of the map in the object store.  If there is no map
-server, or it is dead, the worker lets a process of its own claim the map.  A connection is kept while
-requests or subscribers wait, and for 10 s longer.  Requests without a reply are sent again after a
-reconnection: every operation of a live map may be repeated without harm.
+server, or it has failed, the worker lets a process of its own claim the map.  A connection is kept while
+requests wait or robots subscribe, and for 10 s longer.  Requests without a reply are sent again after a
+reconnection: an operation of a live map has the same effect if it is repeated.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ _IDLE_POLL_S = 1.0
 _LINGER_S = 10.0
 """Seconds for which a worker keeps its connection to a map server after the last request or subscriber."""
 _PREPARE_SHARE = 0.66
-"""Share of ``live.lease_s`` without a renewal after which a worker starts a spare process, so that the
-process has imported its modules when the lease expires."""
+"""Fraction of ``live.lease_s``: a map server that has not renewed its lease for this long lets the worker
+start a spare process, so that the spare has imported its modules when the lease expires."""
 _BUSY_RETRY_MS = 500.0
 """Milliseconds after which a robot sends a request again that no map server answered in time."""
 _EMPTY_MAP_UPDATE = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
@@ -115,6 +115,7 @@ class _PendingRequest:
     future: asyncio.Future[dict[str, Any]]
 
     def refuse(self, error: Exception) -> None:
+        """Let the request fail with *error*, unless it has a reply or has failed already."""
         if not self.future.done():
             self.future.set_exception(error)
 
@@ -148,7 +149,7 @@ class MapConnection:
         self.is_watched = False
         """Whether robots of this worker subscribe to the map."""
         self.may_start = False
-        """Whether a map server is started for these subscribers; requests start one in any case."""
+        """Whether the subscribers may start a map server if the map has none; requests always may."""
         self._context = context
         self._on_update = on_update
         self._on_end = on_end
@@ -209,7 +210,7 @@ class MapConnection:
             self._last_use_s = self._context.clock()
 
     def set_watched(self, is_watched: bool, *, may_start: bool = True) -> None:
-        """Begin or end the updates of the map.
+        """Set whether *on_update* is called with the updates of the map.
 
         Args:
             is_watched: Whether updates are wanted.
@@ -288,7 +289,7 @@ class MapConnection:
             elif record.epoch != self._dead_epoch:
                 self._prepare_spare()
                 await self._pause(_POLL_S)
-        # 5. Otherwise wait until a starting map server accepts connections, or a dead one may be replaced.
+        # 5. Otherwise wait until a starting map server accepts connections, or a failed one may be replaced.
         else:
             self._send_state("moving")
             await self._pause(_POLL_S)
@@ -497,6 +498,7 @@ class MapConnection:
         return True
 
     def _send_request(self, number: int, pending: _PendingRequest) -> None:
+        """Send a request to the map server if it is connected; otherwise do nothing (see `_send`)."""
         request = msgspec.msgpack.encode(pending.request)
         self._send(["request", number, list(pending.robot), pending.operation, request])
 
@@ -561,10 +563,12 @@ class MapConnection:
         return bool(self._pending) or self.may_start
 
     def _prepare_spare(self) -> None:
+        """Start a spare map-server process, if the map needs a map server and there is no spare."""
         if self._needs_map_server:
             self._context.pool.prepare_spare()
 
     def _is_needed(self) -> bool:
+        """Return whether the map has requests or subscribers, or had some within the last 10 s."""
         if self._is_closed:
             return False
         if self._pending or self.is_watched:

@@ -13,7 +13,7 @@ A map counts as only watched if it gets no commands.  Of several such maps, the 
 longest is given up; of several maps of the third kind, the one whose process was taken last.  If there is no
 map of these kinds, requests to the map in need fail with Busy.
 
-One started process may wait for its map (the spare), so that a takeover does not wait for imports.
+One process without a map, the spare, may be started in advance, so that a takeover does not wait for imports.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ DEFAULT_IMPLEMENTATION = "rse_pf.server.live_map.map_server.environment:LIVE_MAP
 _PROCESS_ENTRY_POINT = "rse_pf.server.live_map.map_server.process:run"
 """Function that a map server's process runs, as ``module:name``; the worker does not import this module."""
 _MAX_MEMORY_BYTES = 2 << 30
-"""Memory limit in bytes of one map server's process; a process that needs more exits, and its map is taken
-over."""
+"""Memory limit in bytes of one map server's process; a process that needs more exits, and another process
+takes its map over."""
 _SPARE_IMPORT_NICE = 10
 """Additional niceness of a spare process while it imports modules, because nobody waits for it."""
 _READ_BYTES = 1 << 16  # largest number of bytes that one read of a process's socket returns
@@ -105,11 +105,11 @@ class MapServerProcess:
         self.unused_since_s: float | None = None
         """Monotonic time since which its map is only watched; None while commands arrive, and for a spare."""
         self.is_releasing = False
-        """Whether the process was ordered to give its map up."""
+        """Whether the process was ordered to release its map."""
         self.final_cpu_s = 0.0
         """CPU time in seconds that the process used for its map, set when it has exited."""
         self.epoch: int | None = None
-        """Epoch of its lease from the time on at which it serves its map; before, None."""
+        """Epoch of the process's lease; None until the process serves its map."""
         self.on_exit: Callable[[MapServerProcess, int], None] = lambda process, exit_code: None
         """Called with this object and the exit code when the process has exited."""
         self._clock = clock
@@ -234,7 +234,7 @@ class MapServerPool:
         self._max_processes = max_processes
         self._keeps_spare = keeps_spare
         self._clock = clock
-        self._reserved_for = ""  # tenant for whose map a process was freed
+        self._reserved_for = ""  # tenant for which the next free process is reserved until _reserved_until_s
         self._reserved_until_s = float("-inf")
         self._wanted_until_s = float("-inf")  # until then, maps that are only watched get no process
         self._in_use: dict[MapServerProcess, None] = {}
@@ -272,9 +272,10 @@ class MapServerPool:
         *,
         is_watched_only: bool = False,
     ) -> MapServerProcess | None:
-        """Return a process for a map, which may not be ready yet, or None if the map must ask again later.
+        """Assign a process to a map and return it, or return None if the map must ask again later.
 
-        If all processes are in use, a map with commands lets another map be ordered to give its process up.
+        The returned process may still import its modules.  If all processes are in use and the map has
+        commands, another map may be ordered to give up its process for a later call.
 
         Args:
             tenant: Tenant of the map.
@@ -398,6 +399,7 @@ class MapServerPool:
         self._spare = None
 
     def _prepare_spare_later(self) -> None:
+        """Start a spare in 3 s, if the pool keeps spares, has none, and no such timer is set."""
         if self._keeps_spare and self._timer is None and self._spare is None:
             self._timer = asyncio.get_running_loop().call_later(_SPARE_DELAY_S, self._start_spare_now)
 

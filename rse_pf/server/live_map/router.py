@@ -314,7 +314,7 @@ class LiveMapRouter(CommandQueue):
         )
 
     def give_up(self) -> None:
-        """Release the maps that this worker's processes serve, because the server drains."""
+        """Order this worker's map servers to release their maps, because the server drains; does not wait."""
         self._client.give_up()
 
     def close(self) -> None:

@@ -60,9 +60,7 @@ class _WatchedMap:
 
     tenant: str
     name: str
-    updates: dict[str, _MapUpdate] = field(
-        default_factory=dict
-    )  # the newest update of each key, the oldest first
+    updates: dict[str, _MapUpdate] = field(default_factory=dict)  # newest update by key, the oldest first
     subscriptions: dict[_Subscription, None] = field(default_factory=dict)
     starters: set[_Subscription] = field(default_factory=set)  # those for which a map server may be started
     may_start: bool | None = None  # whether `watch` was last called with True or False; None: not called yet
@@ -70,6 +68,8 @@ class _WatchedMap:
 
 @dataclass(eq=False, slots=True)
 class _Subscription:
+    """A subscription of one connection to one map; ``id`` is the robot's id of the subscription."""
+
     subscriber: Subscriber
     id: int
     map: _WatchedMap
@@ -170,7 +170,7 @@ class Subscriptions:
             self._update_watch(subscription.map)
 
     def _update_watch(self, watched_map: _WatchedMap) -> None:
-        """Call ``watch`` for a map unless its last call said the same about starting a map server."""
+        """Call ``watch`` for a map that is new, or if it has changed whether a map server may be started."""
         may_start = bool(watched_map.starters)
         if may_start != watched_map.may_start:
             watched_map.may_start = may_start
@@ -221,6 +221,7 @@ class Subscriptions:
                 self._schedule(subscription)
 
     def _schedule(self, subscription: _Subscription) -> None:
+        """Let the next round of sending serve *subscription*, at least 10 ms after the last round began."""
         self._due[subscription] = None
         if not self._has_round:
             self._has_round = True
@@ -303,6 +304,7 @@ class Subscriptions:
         return encoded
 
     def _retry_later(self, subscription: _Subscription) -> None:
+        """Try *subscription*, whose socket is full, again after at most 0.05 s."""
         self._slow[subscription] = None
         if not self._has_slow_retry:
             self._has_slow_retry = True

@@ -1,5 +1,5 @@
-"""Run the process that serves one live map; `process` is its entry point, and `map_server` has its rules.
+"""The map server: the process that serves one live map; `process` is its entry point, `map_server` its rules.
 
-What a worker does to reach or start this process is in the package above.  The map itself is
-`rse_pf.live_map`.
+How a worker starts this process and connects to it belongs to `rse_pf.server.live_map`, and the map itself,
+without processes, to `rse_pf.live_map`.
 """

@@ -191,11 +191,10 @@ def _select_evenly(sources: Sequence[PointSource]) -> list[PointSource]:
         rows_by_robot.setdefault(source.robot, []).append(row)
     selected: list[int] = []
     robots_left = len(rows_by_robot)
-    for rows in sorted(
-        rows_by_robot.values(), key=len
-    ):  # what a robot with few keyframes leaves is shared by the others
-        share = (_MAX_SOURCES - len(selected)) // robots_left
-        picks = np.linspace(0, len(rows) - 1, min(share, len(rows))).astype(np.int64)
+    # Robots with the fewest keyframes come first, so that the others divide the number that these leave.
+    for rows in sorted(rows_by_robot.values(), key=len):
+        max_keyframes = (_MAX_SOURCES - len(selected)) // robots_left
+        picks = np.linspace(0, len(rows) - 1, min(max_keyframes, len(rows))).astype(np.int64)
         selected += [rows[pick] for pick in picks]
         robots_left -= 1
     return [sources[row] for row in sorted(selected)]

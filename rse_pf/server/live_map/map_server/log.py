@@ -97,9 +97,11 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 
 
 class _StoredSnapshot(msgspec.Struct, frozen=True, array_like=True):
+    """A snapshot as stored in MessagePack in the object ``snapshot/NUMBER``; the parts are other objects."""
+
     digest: str  # SHA-256 of the head, by which a damaged snapshot is recognised
-    unmeasured: tuple[int, ...]  # see MapSnapshot
-    head: bytes
+    unmeasured: tuple[int, ...]  # ids of keyframes without an event LoopClosuresMeasured in the log
+    head: bytes  # encoded state of the map without the parts
     parts: dict[str, str] = {}  # names of the objects below features/, keyed by the name of the part
 
 
@@ -327,6 +329,7 @@ class LiveLog:
                 self._store.delete(stored_object.name)
 
     def _delete_entries_until(self, number: int) -> None:
+        """Delete the log entries up to *number*; if the log keeps all, only those up to its base."""
         if self._keeps_all:
             number = min(number, self._base)
         last = self._entry_name(number)
@@ -467,6 +470,7 @@ class LogWriter:
             await self._apply_entry(position, batch)
 
     def _next_batch(self) -> list[SubmittedEvent]:
+        """Take the events of the next entry from the queue: at least one, as many as the limits allow."""
         batch = [self._queue.popleft()]
         size_bytes = batch[0].size_bytes
         while self._queue and len(batch) < _MAX_ENTRY_EVENTS:

@@ -57,8 +57,8 @@ _MAX_FINAL_PUBLICATION_S = 3.0
 """Seconds for which the release of a map waits for the publication of its last version; if that takes longer,
 the next map server publishes the version."""
 _UNUSED_SHARE = 1.0 / 6.0
-"""Share of ``live.idle_s`` without a command after which a map counts as not used, whether or not it has
-subscribers: its process may then be taken for another map."""
+"""Fraction of ``live.idle_s``: a map without a command for this long counts as not used, whether or not it
+has subscribers, and its process may be taken for another map."""
 _WAITING_FOR_STORE = "waiting for the store"  # state of the map that subscribers are sent
 _ALIGNMENT_OUTCOMES = (Joined, Corrected, Unaligned, Ambiguous, LoopClosureRejected)
 """Classes of outcomes that can change an alignment, or the reason why a robot has none."""
@@ -78,7 +78,7 @@ class MapMoving(Busy):
 
 
 class MapServer:
-    """Serves one live map: keeps its lease, applies its log, and sends updates; ends with the lease.
+    """Serves one live map while it holds the map's lease: writes and applies the log, replies, sends updates.
 
     All methods are called in the event loop, except those whose docstrings name the thread of the map, the
     only thread that uses the map itself.
@@ -278,6 +278,7 @@ class MapServer:
             await self._requests.delete_objects_of_forgotten()
 
     def _log_alignments(self, outcomes: Iterable[Outcome]) -> None:
+        """Log ``live-aligned`` or ``live-alignment-lost`` for each robot whose alignment was made or lost."""
         for outcome in outcomes:
             if isinstance(outcome, Joined):
                 self._environment.log.info(
@@ -327,7 +328,7 @@ class MapServer:
 
         Raises:
             QuotaExceeded: The tenant would store more than its quota.
-            StoreFull: The disk is nearly full, and the tenant holds more than its share.
+            StoreFull: The disk is nearly full, and the tenant holds more bytes than it may then.
             Busy: Other processes changed the account at each try.
         """
         account = self._environment.account
@@ -460,8 +461,7 @@ class MapServer:
             if self._state.position > self._snapshot_position:
                 await self._write_snapshot()
             # 3. Publish a requested version without the pause of ``live.publish_pause_s``, because the next
-            #    map
-            # server may start late; wait for that at most 3 s.
+            # map server may start late; wait for that at most 3 s.
             await asyncio.wait(
                 {asyncio.ensure_future(self._publisher.publish_now())}, timeout=_MAX_FINAL_PUBLICATION_S
             )
@@ -501,6 +501,7 @@ class MapServer:
         self._end("lost")
 
     def _end(self, end: ServiceEnd) -> None:
+        """Let `run` return *end*, unless the service has ended; wake replies that wait for a renewal."""
         if not self._ended.done():
             self._ended.set_result(end)
         self._renewed.set()

@@ -150,7 +150,14 @@ def run(worker: socket.socket) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Endpoint:
-    """Where the map server listens, and the SHA-256 in hex of its certificate."""
+    """Where the map server listens.
+
+    Attributes:
+        address: Address under which the workers of other servers reach it.
+        listener: The listening socket.
+        context: TLS context with the certificate.
+        certificate: SHA-256 in hex of the certificate.
+    """
 
     address: str
     listener: socket.socket
@@ -159,6 +166,7 @@ class _Endpoint:
 
     @property
     def port(self) -> int:
+        """TCP port on which the socket listens."""
         return int(self.listener.getsockname()[1])
 
 
@@ -197,6 +205,7 @@ class _MapServerProcess:
         )
 
     async def run(self) -> None:
+        """Claim the lease, restore the map and serve it; return when the process has to exit."""
         self._threads.start()
         self._log.start()
         # 1. Claim the lease; if another process was first, report ``lost`` and exit.

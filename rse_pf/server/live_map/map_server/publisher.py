@@ -59,6 +59,8 @@ CPU time."""
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Request:
+    """A request for a version; two requests with the same note are different objects."""
+
     note: str
 
 
@@ -154,6 +156,7 @@ class Publisher:
 
     @property
     def _is_changed(self) -> bool:
+        """Whether the map has keyframes, and differs from the last version of this object or has none yet."""
         return self._state.keyframes > 0 and self._state.changes != self._published_changes
 
     async def _publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
@@ -287,6 +290,7 @@ class Publisher:
 
 
 def _is_automatic(record: MapRecord) -> bool:
+    """Return whether a live map published this version by itself, which its author and note show."""
     return record.author.startswith(_AUTHOR_PREFIX) and record.note in _AUTOMATIC_NOTES
 
 

@@ -150,6 +150,7 @@ class MapState:
         return self.live_map.digest()
 
     def _apply_event(self, event: Event) -> tuple[list[Outcome], Exception | None]:
+        """Apply *event*; return its outcomes and None, or no outcomes and the exception of the map."""
         try:
             outcomes = self.live_map.apply(event)
         except MemoryError:
@@ -167,7 +168,7 @@ class MapState:
 def _call_guarded(act: Callable[[], _T], *, on_defect: _T) -> _T:
     """Return the result of *act*, or *on_defect* if it raises anything but MemoryError.
 
-    A defect must not end the map server.
+    A defect in one measurement must not stop the map server.
     """
     try:
         return act()

@@ -115,6 +115,7 @@ class WorkerConnections:
         writer: asyncio.StreamWriter,
         mark_authenticated: Callable[[], object],
     ) -> None:
+        """Authenticate the peer of a new connection by its token, and serve it until it disconnects."""
         connection = _WorkerConnection(self._map_server, writer, self._on_defect)
         connection.start()
         try:
@@ -252,6 +253,7 @@ class _WorkerConnection:
             self._request_slots.release()
 
     async def _write_messages(self) -> None:
+        """Write queued messages, updates and the newest renewal to the socket until it fails."""
         with contextlib.suppress(OSError):
             while True:
                 await self._has_unsent.wait()
