@@ -134,7 +134,7 @@ class AuditLog:
         self.add([Entry(time=now, actor=self.who, action=action, subject=subject, detail=detail)])
 
     def add(self, entries: Iterable[Entry]) -> None:
-        """Add *entries* for the next flush; beyond 20,000 waiting entries, further ones are lost and counted."""
+        """Add *entries* for the next flush; beyond 20,000 waiting entries, they are lost and counted."""
         with self._buffer_lock:
             for entry in entries:
                 if len(self._waiting) >= _MAX_WAITING:

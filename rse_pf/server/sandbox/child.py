@@ -192,7 +192,7 @@ def _serve(plan: SandboxPlan, connection: socket.socket) -> None:
         except BaseException as error:  # noqa: BLE001  a service may raise anything, SystemExit included
             traceback.print_exc(limit=_FRAMES_SHOWN)
             text = f"{type(error).__name__} in service {name!r}"
-            answer = [False, InternalError.code, text, "the server's log has it"]
+            answer = [False, InternalError.code, text, "read the traceback in the server's log"]
         answer.append((time.perf_counter() - began) * 1e3)
         connection.sendall(_encode_within(answer, plan.max_bytes))
 
@@ -218,7 +218,7 @@ def _answer(plan: SandboxPlan, runtimes: dict[str, Runtime], kind: str, name: st
             sys.stderr.write(error.report() + "\n")
             sys.stderr.flush()
             raise InternalError(
-                f"service {name!r} cannot be loaded", hint="the server's log says why"
+                f"service {name!r} cannot be loaded", hint="read the reason in the server's log"
             ) from error
     if kind == "restore":
         if runtime.has_snapshots:

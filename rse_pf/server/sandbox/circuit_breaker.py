@@ -127,8 +127,8 @@ class CircuitBreaker:
         ends = self._ends_of_request.get((service, digest), ())
         if ends and any(self._poison_until(scope, ends) > now for scope in _scopes_of(robot)):
             return Poison(
-                "this request crashed every sandbox that ran it and is not tried again",
-                hint="send another one; the server's log has the crash",
+                f"this request crashed the sandboxes that ran it, and is refused for up to {POISON_S:.0f} s",
+                hint="send a different request, and read the reason of the crash in the server's log",
             )
         if not self._breakers:
             return None
@@ -297,7 +297,7 @@ def _refusal_of(service: str, breaker: _Breaker, left_s: float) -> WorkerLost:
         hint = "allow it more time: send a longer deadline"
     else:
         how = "crashed repeatedly"
-        hint = "report it to the operator; the server's log has the crashes"
+        hint = "ask the operator to read the reasons of the crashes in the server's log"
     return WorkerLost(
         f"service {service!r} {how} and is refused for another {left_s:.0f} s",
         hint=hint,

@@ -406,8 +406,8 @@ class SandboxPolicy:
             self._move_waiting(sandbox, now)
         elif isinstance(outcome, BaseException):
             hint = outcome.hint if isinstance(outcome, RsePfError) else ""
-            reason = f"the state of the service cannot be kept: {outcome}"
-            failure = StoreError(reason, hint=hint or "send it again")
+            reason = f"the state of service {call.service!r} cannot be loaded or stored: {outcome}"
+            failure = StoreError(reason, hint=hint or "send the command again")
             self._finish(sandbox, call, failure, now)
         elif sandbox.unsaved is not None:
             sandbox.snapshots[call.service] = sandbox.unsaved.snapshot
@@ -532,7 +532,7 @@ class SandboxPolicy:
 
     def _no_place_error(self) -> Busy:
         return Busy(
-            f"all {self._max_sandboxes} sandboxes of this server are in use",
+            f"all {self._max_sandboxes} sandboxes of this worker are in use",
             hint="send the command again after retry_after_ms",
             retry_after_ms=_BUSY_RETRY_MS,
         )
@@ -686,6 +686,6 @@ class SandboxPolicy:
 
 def _worker_lost(service: str, why: str) -> WorkerLost:
     return WorkerLost(
-        f"service {service!r} ended while it worked on this command: {why}",
-        hint="the server's log has what it printed last",
+        f"the sandbox of service {service!r} ended while it worked on this command: {why}",
+        hint="read in the server's log what the service printed last",
     )

@@ -131,7 +131,9 @@ class ReloadingSandboxes(CommandQueue):
             self._switch(fresh)
             return
         self._next = fresh
-        self._give_up = self._loop.call_later(self._start_timeout_s, self._refuse, fresh, "it did not start")
+        self._give_up = self._loop.call_later(
+            self._start_timeout_s, self._refuse, fresh, "its zygote did not start in time"
+        )
         fresh.sandboxes = self._make_manager(services, fresh, functools.partial(self._on_ready, fresh))
 
     def _make_manager(

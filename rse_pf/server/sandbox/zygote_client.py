@@ -225,7 +225,7 @@ class ZygoteClient:
                 self._on_gone(report["id"], report["how"])
 
     def _report_readiness(self, missing: tuple[str, ...] | None) -> bool:
-        """Let the event loop call *on_ready* with *missing*; return False if there is none, or it was used."""
+        """Let the event loop call *on_ready* with *missing*; return False if it is None or was called."""
         on_ready, self._on_ready = self._on_ready, None
         if on_ready is not None:
             self._loop.call_soon(on_ready, missing)
