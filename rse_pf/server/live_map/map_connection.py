@@ -60,7 +60,8 @@ _CONNECT_TIMEOUT_S = 1.0
 connection counts as failed, and the worker reads the lease again."""
 _POLL_S = 0.1
 """Seconds between two reads of the lease while the map has no connected map server but needs one, while the
-store fails, or while the connected map server has not renewed its lease for `_PREPARE_SHARE` of it."""
+store fails, or while the connected map server has not renewed its lease for `_PREPARE_SHARE` times
+``live.lease_s``."""
 _RECONNECT_S = 0.02
 """Seconds after the end of a connection until the lease is read again: a map server that gives the map up
 refuses requests first, and releases its lease a moment later."""

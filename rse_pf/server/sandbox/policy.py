@@ -55,7 +55,7 @@ __all__ = [
 START_TIMEOUT_S = 5.0  # seconds after which a sandbox that has not reported its start is killed
 _MAX_TRIES = 2  # sandboxes in which one command runs at most: a crash may have another cause than the command
 _BUSY_RETRY_MS = 1000.0  # milliseconds after which a robot that got no sandbox is asked to send again
-_KEPT_S = 3.0  # seconds for which a free place is kept for a refused tenant: above `_BUSY_RETRY_MS`
+_KEPT_S = 3.0  # seconds for which a place is kept for a refused robot, which asks again after _BUSY_RETRY_MS
 _DEADLINE_HINT = "set a longer deadline, or send fewer commands to this service"
 _DEADLINE_FACTOR = 2.0  # a sandbox is killed after this many times the time that its command is allowed
 
@@ -124,7 +124,7 @@ class KillSandbox:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseSandbox:
-    """Kill the process of sandbox *number*, if it runs, and close its channel; its events end here."""
+    """Kill the process of sandbox *number*, if it runs, and close its channel; no event of it follows."""
 
     number: int
 
