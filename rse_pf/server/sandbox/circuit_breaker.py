@@ -46,7 +46,7 @@ __all__ = [
 WINDOW_S = 30.0  # seconds within which ``services.breaker_crashes`` crashes or overruns open a breaker
 OPEN_S = 60.0  # seconds for which an open circuit breaker refuses a service; then the service is tried again
 POISON_CRASHES = 2  # crashes that make a request poison: after a crash, the request is retried once
-POISON_S = 600.0  # seconds for which a poison request is refused, counted from the crashes that prove it
+POISON_S = 600.0  # seconds for which a request is refused as poison, from the first of the counted crashes on
 ROBOTS_OF_A_TENANT = 3  # robots with crashed sandboxes from which on all robots of their tenant are refused
 ROBOTS_OF_OTHERS = 2  # robots with crashes outside the most affected tenant, before all robots are refused
 _MAX_REQUESTS = 10_000  # most requests whose crashes are stored; the one that crashed longest ago is removed
@@ -229,6 +229,7 @@ class CircuitBreaker:
                 self._open(service, scope, end)
 
     def _open(self, service: str, scope: Scope, last: _End) -> None:
+        """Open the circuit breaker of *service* for *scope* after the end *last*; remove closed ones."""
         now = last.at_s
         self._breakers = {
             key: breaker
@@ -241,6 +242,7 @@ class CircuitBreaker:
             del self._breakers[next(iter(self._breakers))]
 
     def _poison_until(self, scope: Scope, ends: tuple[_End, ...]) -> float:
+        """Return until when a request with the crashes *ends* is poison for *scope*; -inf if it is not."""
         return _evidence_since(scope, ends, self._poison_crashes) + POISON_S
 
     def _oldest_s(self) -> float:

@@ -205,7 +205,7 @@ class SandboxManager:
         self._execute(self._policy.submit(call, self._monotonic()))
 
     def close(self) -> None:
-        """Kill every sandbox, and wait until the zygote has exited (it is killed after 0.5 s)."""
+        """Kill every sandbox, and wait until the zygote has exited; the zygote is killed after 0.5 s."""
         self._execute(self._policy.close())
         self._zygote.close()
 
@@ -317,7 +317,7 @@ class SandboxManager:
         )
 
     def _set_timer(self) -> None:
-        """Set a timer for `SandboxPolicy.wake_s`, unless an earlier one is set: that one sets the next."""
+        """Set a timer for `SandboxPolicy.wake_s`; a timer that is set for an earlier time stays instead."""
         wake_s = self._policy.wake_s
         if wake_s >= self._timer_s:
             return

@@ -461,9 +461,7 @@ class SandboxPolicy:
                 sandbox.late_s = math.inf
                 self._answer(call, Expired("the service did not answer in time", hint=_DEADLINE_HINT))
             if sandbox.kill_s <= now:
-                sandbox.is_overrun = (
-                    call is not None and not sandbox.fault
-                )  # a fault: it is being killed already
+                sandbox.is_overrun = call is not None and not sandbox.fault  # fault: it is killed already
                 self._kill(sandbox, "it did not start in time" if call is None else "it took too long")
         return self._take_actions()
 

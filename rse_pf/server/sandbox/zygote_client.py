@@ -138,7 +138,7 @@ class ZygoteClient:
         A pidfd is used because a process id may belong to another process by now.
         """
         if number in self._handles:
-            with contextlib.suppress(ProcessLookupError):  # it has ended, which the zygote reports
+            with contextlib.suppress(ProcessLookupError):  # the process has ended; the zygote reports that
                 signal.pidfd_send_signal(self._handles[number], which)
 
     def _launch(self) -> None:
