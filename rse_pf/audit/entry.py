@@ -31,7 +31,7 @@ REFUSALS_PER_S = 2.0
 """Refusals per second of which each gets an entry of its own in the long run, for one worker or data server;
 further refusals are only counted, so that refused requests cannot fill the disk."""
 REFUSAL_BURST = 50
-"""Refusals that get an entry each within a short time, after a time without refusals."""
+"""Largest number of refusals that get an entry each at once, after a time without refusals."""
 _MAX_CHARACTERS = 200
 """Longest string in an entry, in characters; a longer string is cut."""
 _MAX_DETAILS = 64

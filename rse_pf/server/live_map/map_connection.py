@@ -261,8 +261,8 @@ class MapConnection:
         Returns after one such step; after a connection, when it has ended.
         """
         record, lease_s = self._lease.record, self._context.settings.lease_s
-        # 1. If the map does not exist or was stopped, answer all requests but those that begin it; without
-        # a request that begins it, wait.
+        # 1. If the map does not exist or was stopped, answer all requests but those that begin the map; if no
+        # request begins the map, wait.
         if record is None or record.state == "stopped":
             self._refuse_requests_without_map(is_stopped=record is not None)
             if not any(can_begin_map(pending.request) for pending in self._pending.values()):
@@ -539,7 +539,7 @@ class MapConnection:
                 )
 
     def _refuse_all(self, reason: str) -> None:
-        """Let all requests to this map that have no reply fail with Busy; *reason* ends the message."""
+        """Let all requests to this map that have no reply fail with Busy; *reason* is part of the message."""
         for pending in self._pending.values():
             pending.refuse(
                 Busy(

@@ -29,11 +29,11 @@ MACHINES = ("x86_64", "aarch64")
 Numbers = dict[str, tuple[int | None, int | None]]
 """By name of a system call, its numbers on x86_64 and on aarch64; None if that machine does not have it."""
 
-_MEMORY: Numbers = {  # for malloc, numpy's arrays, LuaJIT's machine code and shared libraries
+_MEMORY: Numbers = {  # calls for malloc, numpy's arrays, LuaJIT's machine code and shared libraries
     "brk": (12, 214), "madvise": (28, 233), "mmap": (9, 222), "mprotect": (10, 226), "mremap": (25, 216),
     "munmap": (11, 215),
 }  # fmt: skip
-_READ: Numbers = {  # to read modules, libraries and files of a service; the second line for old C libraries
+_READ: Numbers = {  # calls to read modules, libraries and files; the second line for old C libraries
     "chdir": (80, 49), "close": (3, 57), "dup": (32, 23), "dup3": (292, 24), "faccessat": (269, 48),
     "access": (21, None), "dup2": (33, None), "lstat": (6, None), "open": (2, None), "stat": (4, None),
     "fcntl": (72, 25), "fstat": (5, 80), "fstatfs": (138, 44), "getcwd": (79, 17), "getdents64": (217, 61),
@@ -41,7 +41,7 @@ _READ: Numbers = {  # to read modules, libraries and files of a service; the sec
     "read": (0, 63), "readlink": (89, None), "readlinkat": (267, 78), "readv": (19, 65),
     "statfs": (137, 43), "statx": (332, 291),
 }  # fmt: skip
-_WRITE: Numbers = {  # to write files in the scratch folder and to print; sendfile to copy files
+_WRITE: Numbers = {  # calls to write files in the scratch folder and to print; sendfile to copy files
     "chmod": (90, None), "link": (86, None), "mkdir": (83, None), "rename": (82, None), "rmdir": (84, None),
     "symlink": (88, None), "unlink": (87, None),
     "copy_file_range": (326, 285), "fallocate": (285, 47), "fchmod": (91, 52), "fchmodat": (268, 53),
@@ -50,27 +50,27 @@ _WRITE: Numbers = {  # to write files in the scratch folder and to print; sendfi
     "sendfile": (40, 71), "symlinkat": (266, 36), "truncate": (76, 45), "unlinkat": (263, 35),
     "utimensat": (280, 88), "write": (1, 64), "writev": (20, 66),
 }  # fmt: skip
-_WORKER: Numbers = {"recvfrom": (45, 207), "sendto": (44, 206)}  # for the socket to the worker
-_PROCESS: Numbers = {  # with which a C library reads properties of its process; futex for locks of threads
+_WORKER: Numbers = {"recvfrom": (45, 207), "sendto": (44, 206)}  # calls for the socket to the worker
+_PROCESS: Numbers = {  # calls to read properties of the own process; futex for locks of threads
     "exit": (60, 93), "exit_group": (231, 94), "futex": (202, 98), "getegid": (108, 177),
     "geteuid": (107, 175), "getgid": (104, 176), "getpid": (39, 172), "getppid": (110, 173),
     "getrandom": (318, 278), "getrlimit": (97, 163), "getrusage": (98, 165), "gettid": (186, 178),
     "getuid": (102, 174), "prctl": (157, 167), "prlimit64": (302, 261), "sched_getaffinity": (204, 123),
     "sysinfo": (99, 179), "times": (100, 153), "uname": (63, 160),
 }  # fmt: skip
-_TIME: Numbers = {  # for sleep, and clocks on virtual machines where they cannot be read without a call
+_TIME: Numbers = {  # calls for sleep, and clocks on virtual machines where they cannot be read without a call
     "clock_getres": (229, 114), "clock_gettime": (228, 113), "clock_nanosleep": (230, 115),
     "gettimeofday": (96, 169), "nanosleep": (35, 101), "time": (201, None),
 }  # fmt: skip
-_SIGNALS: Numbers = {  # for abort(); restart_syscall continues a sleep after SIGSTOP and SIGCONT
+_SIGNALS: Numbers = {  # calls for abort(); restart_syscall continues a sleep after SIGSTOP and SIGCONT
     "kill": (62, 129), "restart_syscall": (219, 128), "rt_sigaction": (13, 134),
     "rt_sigprocmask": (14, 135), "rt_sigreturn": (15, 139), "sigaltstack": (131, 132), "tgkill": (234, 131),
 }  # fmt: skip
-_THREADS: Numbers = {  # for threads of Python, C++ and OpenMP; membarrier when musl loads a library
+_THREADS: Numbers = {  # calls for threads of Python, C++ and OpenMP; membarrier when musl loads a library
     "clone": (56, 220), "getcpu": (309, 168), "membarrier": (324, 283), "rseq": (334, 293),
     "sched_yield": (24, 124), "set_robust_list": (273, 99),
 }  # fmt: skip
-_STANDARD_LIBRARY: Numbers = {  # for Python's asyncio, select, mmap and shutil.copy2, and numpy.memmap
+_STANDARD_LIBRARY: Numbers = {  # calls for Python's asyncio, select, mmap and shutil.copy2, and numpy.memmap
     "epoll_create1": (291, 20), "epoll_ctl": (233, 21), "epoll_pwait": (281, 22), "epoll_wait": (232, None),
     "getsockname": (51, 204), "listxattr": (194, 11), "llistxattr": (195, 12), "msync": (26, 227),
     "poll": (7, None), "ppoll": (271, 73), "pselect6": (270, 72), "select": (23, None),

@@ -423,7 +423,7 @@ class MapServer:
         self.start_task(self._publisher.publish_due())
 
     def _note_command(self) -> None:
-        """Note that a command has arrived, and notify the worker if none had for a while."""
+        """Note the time of a command; notify the worker that the map is used, if it was not used before."""
         if self._last_command_s is None:
             self._environment.on_use(True)
         self._last_command_s = self._environment.clock()

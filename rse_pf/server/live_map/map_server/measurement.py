@@ -111,7 +111,10 @@ class KeyframeMeasurer:
         self._has_work.set()
 
     def request_optimisation(self) -> None:
-        """Optimise the whole pose graph once as soon as no keyframe waits, however often this is called."""
+        """Request one optimisation of the whole pose graph, which begins when no keyframe waits.
+
+        Further calls before it begins have no effect.
+        """
         self._needs_optimisation = True
         self._has_work.set()
 

@@ -59,7 +59,7 @@ CPU time."""
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Request:
-    """A request for a version; two requests with the same note are different objects."""
+    """A request for a version with a note; requests are compared by identity, not by their notes."""
 
     note: str
 
