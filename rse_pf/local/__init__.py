@@ -1,4 +1,4 @@
-"""The platform on one machine, box by box after the paper's Fig. 2, in processes of this user.
+"""The platform on one machine: each box of the paper's Fig. 2 runs in processes of this user.
 
-Starts servers with the command that a cloud instance runs; never imports `rse_pf.server`.
+Servers are started with the command that an instance on AWS runs; this package never imports `rse_pf.server`.
 """

@@ -1,7 +1,8 @@
-"""Watch the disks of a local platform: warn before one is full, and refill the disk reserve of the roster.
+"""Watch the disks of a local platform: warn before one is full, and refill the disk reserve.
 
-Servers are neither started nor replaced while the disk of the state folder is full: their logs and
-announcements could not be written.
+The reserve is a file that keeps space for changes of the roster and the deny list, so that an operator can
+still revoke a robot on a full disk.  Servers are neither started nor replaced while the disk of the state
+folder is full: their logs and announcements could not be written.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ __all__ = [
 
 Level = Literal["ok", "low", "full"]
 
-# Time between two checks of the disks, in seconds; work that waits for space continues at the next check.
+# Time between two checks of the disks, in seconds; files that could not be written are written at the next
+# check.
 LOOK_S = 0.5
-# Below this free space a disk counts as full: a server that starts writes about as much.
+# Free bytes below which a disk counts as full: a server that starts writes about as much.
 _FULL_BYTES = 1 << 20
-# A level ends once the free space is a tenth above its threshold, so that levels do not alternate.
+# A disk leaves the level low or full once its free space is this many times the level's threshold, so that
+# the level does not alternate.
 _HYSTERESIS = 1.1
 _DIRECTORY = "dir:"
 _MIB = 1 << 20
@@ -40,7 +43,7 @@ _MIB = 1 << 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiskSpace:
-    """The file system of *folder*, in bytes; what only root may still use is not free."""
+    """Free and total bytes of the file system of ``folder``; space that only root may use is not free."""
 
     folder: str
     free_bytes: int
@@ -49,7 +52,11 @@ class DiskSpace:
 
 
 def disk_level(free_bytes: int, total_bytes: int, before: Level = "ok") -> Level:
-    """Return the level of a disk: ``ok``, ``low`` or ``full``; *before* is its level at the last look."""
+    """Return the level of a disk: ``ok``, ``low`` or ``full``.
+
+    It is full below 1 MiB of free space, and low below `LOW_DISK_PERCENT` of its size.  *before* is its level
+    at the last check: a low or full disk needs a tenth more free space to leave that level.
+    """
     low_bytes = total_bytes * LOW_DISK_PERCENT / 100
     if free_bytes < _FULL_BYTES * (_HYSTERESIS if before == "full" else 1):
         return "full"
@@ -57,14 +64,14 @@ def disk_level(free_bytes: int, total_bytes: int, before: Level = "ok") -> Level
 
 
 def folders_of(state: Path, store: str) -> list[Path]:
-    """Return the folders on which a platform depends: its state, and its store if that is a folder."""
+    """Return the folders that a platform writes to: *state*, and PATH if *store* is ``dir:PATH``."""
     return [state] + ([Path(store.removeprefix(_DIRECTORY))] if store.startswith(_DIRECTORY) else [])
 
 
 def disk_spaces(folders: Iterable[Path]) -> list[DiskSpace]:
-    """Return the file systems of *folders*, each once; a folder that is missing counts as its parent.
+    """Return the file systems of *folders*, each once; for a missing folder, that of its nearest parent.
 
-    Their levels are those of now, while the events of `DiskWatch` lag behind by `_HYSTERESIS`.
+    Their levels are without hysteresis, so they may differ from those of the events of `DiskWatch`.
     """
     spaces: dict[int, DiskSpace] = {}
     for folder in folders:
@@ -79,7 +86,7 @@ def disk_spaces(folders: Iterable[Path]) -> list[DiskSpace]:
 
 
 def disk_line(space: DiskSpace) -> str:
-    """Return *space* as a line for a person; empty if there is enough."""
+    """Return a warning about *space* as one line; "" if its level is ``ok``."""
     sizes = f"{space.free_bytes // _MIB} of {space.total_bytes // _MIB} MiB"
     sentence = f"{sizes} are free on the disk of {space.folder}"
     return {
@@ -90,20 +97,27 @@ def disk_line(space: DiskSpace) -> str:
 
 
 def access_control_store(state: Path) -> AccessControlStore:
-    """Return the roster and the deny list of the platform in *state*; they can be changed on a full disk."""
+    """Return the store of roster and deny list of the platform in *state*.
+
+    It uses the disk reserve, so both can be changed on a full disk.
+    """
     return AccessControlStore(DirectoryStore(state, _reserve(state)))
 
 
 class DiskWatch:
-    """The disks of one platform, as they were at the last look."""
+    """The disks of one platform, as they were at the last check: ``spaces``.
+
+    ``on_space`` is called when a disk that was full has space again.
+    """
 
     def __init__(self, state: Path, store: str, *, emit: Callable[..., None]) -> None:
-        """Look at nothing yet.
+        """Check nothing yet.
 
         Args:
-            state: Folder of the platform.
-            store: Location of its store, such as ``dir:PATH``.
-            emit: Gets ``disk-full``, ``disk-low`` and ``disk-ok``, with ``reason`` and the bytes.
+            state: State folder of the platform.
+            store: Location of its object store, such as ``dir:PATH``.
+            emit: Called with an event and its details: ``disk-full``, ``disk-low`` and ``disk-ok`` when the
+                level of a disk changes, ``not-written`` when a file cannot be written.
         """
         self.spaces: list[DiskSpace] = []
         self.on_space: Callable[[], None] = lambda: None
@@ -114,13 +128,13 @@ class DiskWatch:
         self._unwritten: dict[Path, str] = {}
 
     def is_full(self) -> bool:
-        """Look at the disks, emit what changed, and return whether that of the state folder is full."""
+        """Check the disks now, emit changed levels, and return whether that of the state folder is full."""
         with contextlib.suppress(OSError):
             self._take(disk_spaces(self._folders))
         return self._levels.get(str(self._state)) == "full"
 
     def prepare(self) -> None:
-        """Make the files that an operator changes, and the reserve, as far as there is space."""
+        """Create missing files of roster and deny list, and the reserve, as far as there is space."""
         self.is_full()
         try:
             access_control_store(self._state).create_missing()
@@ -129,7 +143,11 @@ class DiskWatch:
         self._refill()
 
     async def watch(self) -> None:
-        """Look until cancelled; once there is space, write what is left and make the reserve whole."""
+        """Check the disks every `LOOK_S` until cancelled.
+
+        While the state folder's disk is not full, files that `write` could not write are written, and the
+        reserve is refilled.
+        """
         while True:
             await asyncio.sleep(LOOK_S)
             with contextlib.suppress(OSError):  # the folder was removed
@@ -140,7 +158,10 @@ class DiskWatch:
                 await asyncio.to_thread(self._refill)
 
     def write(self, path: Path, text: str) -> None:
-        """Replace the file *path* by *text* in one step, now or as soon as the disk has space."""
+        """Replace the file *path* by *text* in one step, now or once that is possible; never raises OSError.
+
+        The first failure emits ``not-written``; `watch` tries again, with the newest text for *path*.
+        """
         try:
             replace_file(path, text)
             self._unwritten.pop(path, None)
@@ -150,10 +171,11 @@ class DiskWatch:
             self._unwritten[path] = text
 
     def document(self) -> list[dict[str, Any]]:
-        """Return the disks as plain JSON values."""
+        """Return the disks at the last check as plain JSON values."""
         return [asdict(space) for space in self.spaces]
 
     def _take(self, spaces: list[DiskSpace]) -> None:
+        """Store the newest state of the disks, and emit an event for each level that changed."""
         self.spaces = spaces
         for space in spaces:
             before = self._levels.get(space.folder, "ok")
@@ -169,6 +191,7 @@ class DiskWatch:
                     self.on_space()
 
     def _refill(self) -> None:
+        """Refill the reserve for the present size of roster and deny list."""
         with contextlib.suppress(OSError):  # the disk is full again, or the folder was removed
             sizes = ((self._state / name).stat().st_size for name in (ROBOTS_NAME, DENY_NAME))
             _reserve(self._state).fill(sum(sizes))

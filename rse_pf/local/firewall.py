@@ -1,7 +1,7 @@
-"""The firewall box on one machine: what may be listened on, and the key that signs robots' tokens.
+"""The firewall box on one machine: checks of the listener for robots, and the key that signs their tokens.
 
-The listener is on loopback, or, if an operator asks for it, on an address of the network, by TLS and with
-tokens.  The private key is in a file that only its owner can read.
+Robots connect on loopback, or, if an operator asks for it with --lan, at an address of the network, by TLS
+and with tokens.  The private key is in a file that only the operator's user can read.
 """
 
 from __future__ import annotations
@@ -25,17 +25,21 @@ __all__ = [
 
 
 def key_file(folder: Path) -> Path:
-    """Return the file of the private key of the platform in *folder*."""
+    """Return the path of the private key of the platform in *folder*; the file need not exist."""
     return folder / "key.json"
 
 
 def key_set_file(folder: Path) -> Path:
-    """Return the file of the public keys of the platform in *folder*, a JWKS, for its servers."""
+    """Return the path of the platform's public keys, a JWKS that its servers read; it need not exist."""
     return folder / "keys.json"
 
 
 def robots_url(settings: PlatformSettings, port: int, lan: LanListener | None = None) -> str:
-    """Return the address that robots connect to: ``ws://``, or ``wss://`` if there is a certificate."""
+    """Return the address that robots connect to, at *port*.
+
+    It begins with ``wss://`` if there is a *lan* listener or ``local.certificate``, else with ``ws://``.
+    *lan* also gives the host, in place of ``serving.host``.
+    """
     address = settings.serving.host if lan is None else lan.address
     host = f"[{address}]" if ":" in address else address
     scheme = "wss" if settings.local.certificate or lan is not None else "ws"
@@ -43,17 +47,17 @@ def robots_url(settings: PlatformSettings, port: int, lan: LanListener | None = 
 
 
 def check_listener(host: str, port: int, *, is_protected: bool = False) -> None:
-    """Refuse a listener that other machines could reach, or whose port is taken.
+    """Refuse a listener that other machines could reach without protection, or whose port is taken.
 
     Args:
-        host: An address of this machine.
-        port: 0 is always free.
-        is_protected: Whether it has TLS and requires tokens (`check_lan_settings`), so that others may
-            reach it.
+        host: Address of this machine on which to listen.
+        port: Port on which to listen; 0, any free one, is never taken.
+        is_protected: Whether the listener has TLS and requires tokens (`check_lan_settings`), so that other
+            machines may reach it.
 
     Raises:
-        ConfigurationError: *host* is not a loopback address and not protected, it is no address of this
-            machine, or something listens on *port*.
+        ConfigurationError: *host* is neither a loopback address nor protected, it is no address of this
+            machine, or another program listens on *port*.
     """
     if not is_protected and not is_loopback(host):
         raise ConfigurationError(
@@ -77,10 +81,10 @@ def check_listener(host: str, port: int, *, is_protected: bool = False) -> None:
 
 
 def check_lan_settings(settings: PlatformSettings) -> None:
-    """Refuse settings under which no other machine may reach the platform.
+    """Refuse settings with which the platform must not be opened to other machines by --lan.
 
     Raises:
-        ConfigurationError: Robots need no token, or the listener has a certificate from elsewhere.
+        ConfigurationError: ``auth.required`` is off, or ``local.certificate`` is set: --lan makes its own.
     """
     if not settings.auth.required:
         raise ConfigurationError(
@@ -95,10 +99,15 @@ def check_lan_settings(settings: PlatformSettings) -> None:
 
 
 def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
-    """Return the key of *folder*; make it from *seed* (32 secret random bytes) if there is none.
+    """Return the signing key of the platform in *folder*, and write its key files as far as they are missing.
 
-    A platform that starts again keeps its keys, so that robots keep their tokens: a set that a rotation wrote
-    and that holds the newest key stays as it is.
+    A platform that starts again keeps its keys, so that the tokens of robots stay valid.  The set of public
+    keys is written anew only if it lacks the signing key; after a rotation it also holds the key before.
+
+    Args:
+        folder: State folder of the platform.
+        seed: 32 secret random bytes, from which a missing key is made.
+        key_id: Id of a key that is made.
     """
     path = key_file(folder)
     if not path.exists():
@@ -112,7 +121,7 @@ def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
 
 
 def _holds_key(public: Path, key: SigningKey) -> bool:
-    """Return whether the set in the file *public* holds *key*."""
+    """Return whether the set of public keys in the file *public* holds *key*; False if it is unreadable."""
     try:
         public_key = KeySet.from_json(public.read_text(encoding="utf-8")).get(key.key_id)
     except (OSError, UsageError):
@@ -124,10 +133,10 @@ def _holds_key(public: Path, key: SigningKey) -> bool:
 
 
 def read_key(path: Path) -> SigningKey:
-    """Return the key in *path*.
+    """Return the private signing key in the file *path*.
 
     Raises:
-        UsageError: There is no such file, others may read it, or it holds no signing key.
+        UsageError: There is no such file, other users may read it, or it holds no signing key.
     """
     hint = "start a platform with rse-pf local, name the one that runs with --name, or a key with --key"
     return SigningKey.from_json(read_private_file(path, "the key", hint=hint))

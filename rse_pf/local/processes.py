@@ -1,6 +1,8 @@
-"""Identify a process by its pid and its start time, so that a re-used pid is never signalled.
+"""Start, identify, signal and await processes, and rotate their logs.
 
-Signals go through a process handle that is checked after it was opened.  A process that is gone is no error.
+A process is identified by its pid and its start time (`ProcessMark`), so that a process that got the pid of
+an earlier one is never signalled.  Signals go through a process handle (pidfd), whose process is compared
+with the mark after it was opened.  A process that has exited already is no error.
 """
 
 from __future__ import annotations
@@ -49,30 +51,34 @@ _TAIL_BYTES = 8192
 _POLL_S = 0.01
 # Time between two checks of the sizes of logs, in seconds.
 _ROTATE_EVERY_S = 5.0
-# Logs of servers that are kept: hours of a crash loop.
+# Most log files of backend servers in a folder; the oldest are removed.  200 are hours of a crash loop.
 _MAX_LOGS = 200
-# Size of all logs of servers together.
+# Most bytes of all log files of backend servers together; the oldest are removed.
 _MAX_LOGS_BYTES = 1 << 30
-# Free space below which a disk counts as full when a process has logged nothing.
+# Free bytes below which a full disk is named as the reason why a process has logged nothing.
 _FULL_BYTES = 1 << 16
-# Time between two searches for orphans, in seconds: any waiting parent reaps its child sooner.
+# Time between two searches for orphans, in seconds; an orphan is reaped at the second search that finds it,
+# since by then a parent that waits for it has reaped it.
 _REAP_EVERY_S = 2.0
 _spawned: weakref.WeakValueDictionary[int, subprocess.Popen[bytes]] = weakref.WeakValueDictionary()
-"""Children of `spawn` by pid; the holder of a child reaps it, however late."""
-# Time that a process gets to end after a request, in seconds; then it is killed.
+"""Children that `spawn` started, by pid; `reap_orphans` leaves them to the holder of the Popen object."""
+# Time that a process gets to exit after the signal that asks it to, in seconds; then it is killed.
 STOP_TIMEOUT_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessMark:
-    """One process of one boot of this machine.  ``began`` is opaque: clock ticks and boot."""
+    """The identity of one process, which no other process has, also after a restart of this machine.
+
+    ``began`` is its start time in clock ticks, and the id of the machine's boot.
+    """
 
     pid: int
     began: str
 
 
 def mark_of(pid: int) -> ProcessMark | None:
-    """Return the mark of the process that has *pid* now; None if there is none, or it has ended."""
+    """Return the mark of the process that has *pid* now; None if there is none, or it has exited."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
@@ -83,12 +89,12 @@ def mark_of(pid: int) -> ProcessMark | None:
 
 
 def is_alive(mark: ProcessMark) -> bool:
-    """Return whether that very process still runs."""
+    """Return whether the process of *mark* still runs."""
     return mark_of(mark.pid) == mark
 
 
 def send_signal(mark: ProcessMark, number: signal.Signals) -> bool:
-    """Signal that very process; return False, and signal none, if it is gone."""
+    """Send signal *number* to the process of *mark*; return False, and signal none, if it has exited."""
     with _handle(mark) as handle:
         if handle is None:
             return False
@@ -99,7 +105,7 @@ def send_signal(mark: ProcessMark, number: signal.Signals) -> bool:
 
 
 def wait_ended(mark: ProcessMark, timeout_s: float) -> bool:
-    """Block until the process has ended, at most *timeout_s*; return whether it has."""
+    """Block until the process has exited, at most *timeout_s*; return whether it has."""
     with _handle(mark) as handle:
         if handle is None:
             return True
@@ -107,7 +113,7 @@ def wait_ended(mark: ProcessMark, timeout_s: float) -> bool:
 
 
 async def ended(mark: ProcessMark, timeout_s: float | None = None) -> bool:
-    """Wait until the process has ended, at most *timeout_s*; return whether it has."""
+    """Wait until the process has exited, at most *timeout_s* (None: without limit); return whether it has."""
     with _handle(mark) as handle:
         if handle is None:
             return True
@@ -133,17 +139,18 @@ def spawn(
 ) -> subprocess.Popen[bytes]:
     """Start *command* in a process group of its own, so that a terminal's Ctrl-C does not reach it.
 
-    Not in a session of its own: where Linux groups by session (autogroup, a default of desktops), every
-    session gets the same share of the processor, whatever the niceness of what runs in it.
+    It stays in the session of this process: where Linux schedules by session (autogroup, a default of
+    desktops), each session gets the same CPU time, and the niceness of processes would have no effect between
+    sessions.  The process may open as many files as the system permits.
 
     Args:
         command: Program and arguments.
-        log: Where both of its output streams go, behind what is there.
-        folder: Its working directory.
-        dies_with_parent: Whether Linux kills it when the calling thread ends, however that ends.
-        stdin: Nothing, or ``subprocess.PIPE``.
+        log: File to which standard output and standard error of the process are appended.
+        folder: Working directory of the process.
+        dies_with_parent: Whether Linux kills the process when the calling thread ends, for whatever reason.
+        stdin: Its standard input: ``subprocess.DEVNULL``, or ``subprocess.PIPE``.
     """
-    with log.open("ab") as output:  # it appends, so that the log may be cut short under it
+    with log.open("ab") as output:  # with append mode, `rotate_long_logs` may truncate the log meanwhile
         process = subprocess.Popen(
             command,
             cwd=folder,
@@ -154,15 +161,16 @@ def spawn(
         )
     _spawned[process.pid] = process
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may be gone already
+    with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may have exited
         resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (most, most))
     return process
 
 
 async def reap_orphans() -> None:
-    """Reap ended children that this process did not start, until cancelled.
+    """Reap children that have exited and that `spawn` did not start, until cancelled.
 
-    Without an init, the first process of a container is the parent of every process whose own has ended.
+    For the first process of a container without an init: Linux makes it the parent of every process whose own
+    parent has exited.
     """
     before: set[int] = set()
     while True:
@@ -176,10 +184,10 @@ async def reap_orphans() -> None:
 
 
 def _ended_children() -> set[int]:
-    """Return the pids of the children of this process that have ended and are not reaped."""
+    """Return the pids of the children of this process that have exited and are not reaped."""
     ended = set()
     for stat in Path("/proc").glob("[1-9]*/stat"):
-        with contextlib.suppress(OSError):  # it is gone
+        with contextlib.suppress(OSError):  # the process was reaped meanwhile
             state, parent = stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[:2]
             if state == "Z" and int(parent) == os.getpid():
                 ended.add(int(stat.parent.name))
@@ -187,13 +195,15 @@ def _ended_children() -> set[int]:
 
 
 class ServerProcess:
-    """The process of one server with its log and announcement: started here, or adopted.
+    """The process of one server, with its log and its announcement.
 
-    An adopted process was started by an earlier control plane and is no child of this one.
+    The announcement is the JSON file that the server writes once it listens, with its pid and ports.  The
+    process was started here, or adopted: then an earlier control plane started it, and it is no child of this
+    process.  ``mark`` is None while there is no process.
     """
 
     def __init__(self, name: str, folder: Path) -> None:
-        """Describe the process; its files in *folder* begin with *name*."""
+        """Describe the process; its files are *name*.log and *name*.json in *folder*."""
         self.name = name
         self.log = folder / f"{name}.log"
         self.announcement = folder / f"{name}.json"
@@ -203,41 +213,42 @@ class ServerProcess:
         self._log_from = 0
 
     def prepare(self) -> None:
-        """Forget the process before this one: its announcement, and which lines of the log are its own."""
+        """Remove the announcement of the process before, and count lines of the log from its present end."""
         self.announcement.unlink(missing_ok=True)
         self._log_from = log_size(self.log)
 
     def start(self, command: Sequence[str], *, dies_with_parent: bool) -> None:
-        """Start *command* as `spawn` does."""
+        """Start *command* as `spawn` does, in place of the process before."""
         self.prepare()
         self.use(spawn(command, log=self.log, folder=self._folder, dies_with_parent=dies_with_parent))
 
     def use(self, child: subprocess.Popen[bytes]) -> None:
-        """Take *child*, which was just started, for the process."""
+        """Use *child*, which was just started elsewhere, as the process."""
         self._child, self.mark = child, mark_of(child.pid)
 
     @property
     def pid(self) -> int:
-        """The id of the process, also of one that has ended; 0 if there was none."""
+        """The id of the process, also after it has exited; 0 if there was none."""
         if self._child is not None:
             return self._child.pid
         return 0 if self.mark is None else self.mark.pid
 
     def is_running(self) -> bool:
-        """Return whether the process is there."""
+        """Return whether the process runs."""
         if self._child is not None:
             return self._child.poll() is None
         return self.mark is not None and is_alive(self.mark)
 
     def send(self, number: signal.Signals) -> bool:
-        """Signal the process; return False if it is gone."""
+        """Send signal *number* to the process; return False if there is none, or it has exited."""
         return self.mark is not None and send_signal(self.mark, number)
 
     async def wait_announced(self, timeout_s: float) -> dict[str, Any]:
-        """Return the announcement, once the process has written it.
+        """Wait until the process has announced itself, and return the announcement, a JSON object.
 
         Raises:
-            ConfigurationError: The process ended or was not ready in time, or another one announced itself.
+            ConfigurationError: The process exited or wrote no announcement within *timeout_s*, or the
+                announcement has the pid of another process.
         """
         end = time.monotonic() + timeout_s
         while not self.announcement.exists():
@@ -253,37 +264,43 @@ class ServerProcess:
         return document
 
     async def wait_over(self) -> int | None:
-        """Wait for the end; return the exit code (negative: the signal), None if the process was adopted."""
+        """Wait until the process has exited; return its exit code, or minus the signal that ended it.
+
+        None if the process was adopted: Linux gives the exit code to its parent only.
+        """
         if self.mark is not None:
             await ended(self.mark)
         return None if self._child is None else self._child.wait()
 
     async def stop(self, number: signal.Signals, timeout_s: float) -> None:
-        """Signal the process, and kill it if it has not ended after *timeout_s*."""
+        """Send signal *number*, kill the process if it has not exited after *timeout_s*, and reap it."""
         if self.mark is not None and self.send(number):
             await ended(self.mark, timeout_s)
         self.kill()
 
     def kill(self) -> None:
-        """Kill the process, if it is there, reap it, and remove its announcement."""
+        """Kill the process, if it runs, reap it, and remove its announcement."""
         self.send(signal.SIGKILL)
         if self._child is not None:
-            self._child.kill()  # it may have ended before it had a mark
+            self._child.kill()  # without a mark, `send` signalled nothing
             self._child.wait()
         self.announcement.unlink(missing_ok=True)
 
     def last_line(self) -> str:
-        """Return the last line that this process logged; if it has none on a full disk, the cause."""
+        """Return the last line that this process logged.
+
+        If it logged none, a sentence about the disk if that is full, else "".
+        """
         last = last_line(self.log, self._log_from)
         return last or ("there is no space left on its disk" if _is_disk_full(self._folder) else "")
 
     def ending(self) -> str:
-        """Return how the process ended, as part of a sentence."""
+        """Return how the process ended, as the end of a sentence: ``ended with exit code 1``."""
         code = None if self._child is None else self._child.poll()
         return "ended" if code is None else f"ended with exit code {code}"
 
     def failed(self, problem: str) -> ConfigurationError:
-        """Return the error that says *problem* happened, with the last line that the process logged."""
+        """Return an error whose message is the server's name, *problem*, and the last line that it logged."""
         last = self.last_line()
         return ConfigurationError(
             f"{self.name} {problem}{': ' if last else ''}{last}", hint=f"its log is {self.log}"
@@ -291,7 +308,7 @@ class ServerProcess:
 
 
 def log_size(log: Path) -> int:
-    """Return the length of *log* in bytes, 0 if it is missing."""
+    """Return the size of the file *log* in bytes; 0 if it is missing."""
     try:
         return log.stat().st_size
     except OSError:
@@ -299,16 +316,19 @@ def log_size(log: Path) -> int:
 
 
 def last_line(log: Path, start: int = 0) -> str:
-    """Return the last line of *log* that is not empty and no hint, shortened to 300 letters.
+    """Return the last line of *log* that is neither empty nor a hint, cut after 300 characters.
+
+    If there are only hints, the last of them; "" if there is no line, or no file.
 
     Args:
         log: The file.
-        start: Lines before this byte are those of an earlier process.
+        start: Offset in bytes at which the process began to log; earlier lines are not read.  Ignored if the
+            file is shorter, because the log was rotated.
     """
     try:
         with log.open("rb") as file:
             size = log.stat().st_size
-            file.seek(max(start if start <= size else 0, size - _TAIL_BYTES))  # it may have been rotated
+            file.seek(max(start if start <= size else 0, size - _TAIL_BYTES))  # a shorter log was rotated
             text = file.read().decode("utf-8", "replace")
     except OSError:
         return ""
@@ -318,12 +338,12 @@ def last_line(log: Path, start: int = 0) -> str:
 
 
 async def rotate_logs(folder: Path, max_bytes: int, in_use: Collection[str]) -> None:
-    """Rotate the logs of *folder* periodically and remove the oldest of servers, until cancelled.
+    """Rotate long logs and remove the oldest logs of backend servers every 5 s, until cancelled.
 
     Args:
-        folder: With files ``NAME.log``.
-        max_bytes: Length from which a log is rotated.
-        in_use: Names of servers that run, as they come and go.
+        folder: Folder of the files ``NAME.log``.
+        max_bytes: Size above which a log is rotated.
+        in_use: Names of the servers that run; the collection is read again each time.
     """
     while True:
         await asyncio.to_thread(rotate_long_logs, folder, max_bytes)
@@ -334,13 +354,14 @@ async def rotate_logs(folder: Path, max_bytes: int, in_use: Collection[str]) -> 
 def rotate_long_logs(folder: Path, max_bytes: int) -> list[Path]:
     """Rotate every ``*.log`` of *folder* that is longer than *max_bytes*; return those logs.
 
-    Copies and truncates as copytruncate of logrotate(8): the process that writes keeps its descriptor, and
-    the newest lines stay, in the log or in its one predecessor ``NAME.log.1``.  A line that is written
-    between the end of the copy and the cut is lost.
+    Copies and truncates as copytruncate of logrotate(8): the process that writes keeps its open file, and its
+    earlier lines are in ``NAME.log.1``, which replaces the copy before.  A line that is written between the
+    end of the copy and the truncation is lost.  A log that cannot be copied stays, and is tried the next
+    time.
     """
     longer: list[Path] = []
     for log in sorted(folder.glob("*.log")):
-        with contextlib.suppress(OSError):  # it is gone, or the disk is full: try again next time
+        with contextlib.suppress(OSError):  # the log was removed, or the disk is full: try again next time
             if log.stat().st_size > max_bytes:
                 _copy_and_cut(log, log.with_name(f"{log.name}.1"))
                 longer.append(log)
@@ -354,15 +375,15 @@ def remove_old_logs(
     max_logs: int = _MAX_LOGS,
     max_bytes: int = _MAX_LOGS_BYTES,
 ) -> list[Path]:
-    """Remove the oldest logs of servers that have ended, and return them.
+    """Remove the oldest logs of backend servers that have exited, and return the removed files.
 
-    A server's name is not used twice while a platform runs; all other processes have one log each.
+    Only these logs grow in number: each new server has a new name, and so new files.
 
     Args:
-        folder: With files ``server-N.log`` and ``server-N.log.1``.
-        in_use: Names of servers that run; their logs stay.
-        max_logs: How many files stay at most.
-        max_bytes: How long they are together at most.
+        folder: Folder of the files ``server-N.log`` and ``server-N.log.1``.
+        in_use: Names of the servers that run; their logs stay, but count.
+        max_logs: Most files that stay.
+        max_bytes: Most bytes of all files that stay together.
     """
     ages = []
     for log in (*folder.glob("server-*.log"), *folder.glob("server-*.log.1")):
@@ -379,14 +400,17 @@ def remove_old_logs(
 
 
 def _copy_and_cut(log: Path, copy: Path) -> None:
-    """Copy *log* to its end, also what is appended meanwhile, and cut it; the last copy stays until then."""
+    """Copy *log*, also lines that are appended meanwhile, to *copy* in one step, and truncate *log*.
+
+    If an OSError is raised, *copy* stays as it was.
+    """
     part = copy.with_name(f"{TEMPORARY_PREFIX}{copy.name}")
     try:
         with log.open("rb") as source, part.open("wb") as target:
             os.fchmod(target.fileno(), os.fstat(source.fileno()).st_mode)
             shutil.copyfileobj(source, target)
             target.flush()
-            shutil.copyfileobj(source, target)  # what came during the first pass and its end
+            shutil.copyfileobj(source, target)  # lines that were appended during the first pass
             target.flush()
             os.replace(part, copy)
             os.truncate(log, 0)
@@ -404,7 +428,11 @@ def _is_disk_full(folder: Path) -> bool:
 
 
 def _child_setup(parent: int | None) -> Callable[[], None]:
-    """Return what a child does before its program: leave the group, and be killed with *parent*, if any."""
+    """Return the function that a child process calls before it starts its program.
+
+    It puts the child into a process group of its own and, unless *parent* is None, has Linux kill the child
+    when *parent* exits; if *parent* has exited already, the child exits.
+    """
 
     def leave() -> None:
         os.setpgid(0, 0)
@@ -416,7 +444,7 @@ def _child_setup(parent: int | None) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def _handle(mark: ProcessMark) -> Iterator[int | None]:
-    """Yield a handle of exactly the marked process, or None if it has ended."""
+    """Yield a process handle (pidfd) of the process of *mark*; None if it has exited."""
     try:
         handle = os.pidfd_open(mark.pid)
     except ProcessLookupError:

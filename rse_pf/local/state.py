@@ -1,7 +1,7 @@
-"""The folder of a local platform, and its state file ``platform.json`` for other commands.
+"""The state folder of a local platform, and its state file ``platform.json``, which other commands read.
 
-There is one folder per platform name under ``$XDG_STATE_HOME/rse-pf``.  The state file exists while a process
-of the platform runs, and holds no secret: key and token have files of their own.
+There is one folder for each platform name under ``$XDG_STATE_HOME/rse-pf``.  The state file exists while a
+process of the platform runs, and holds no secret: key and token have files of their own.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ __all__ = [
 _FILE = "platform.json"
 _LOCK = "lock"
 _OPTIONAL = ("lan", "authority_file", "rosbridge_server")
-"""Fields that are left out while they are empty: earlier versions refuse unknown fields."""
+"""Fields of `PlatformState` that the file has only if they are set: earlier versions refuse new fields."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerState:
-    """One backend server; ports are 0 until it has announced them."""
+    """One server of any kind in the state file; its ports are 0 until it has announced them."""
 
     name: str
     process: ProcessMark
@@ -55,12 +55,13 @@ class ServerState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformState:
-    """A platform that runs; ``url`` is empty until robots can connect.
+    """The state of a platform that runs, as in its state file.
 
-    ``status_port`` is where the control plane answers ``GET /status``, ``launched`` the highest number that
-    a server's name ever had; ``control_token_file`` is empty if the control ports ask for no token.
-    ``lan`` is the address at which other machines connect, empty if none can; ``authority_file`` is then the
-    certificate by which they know the platform.
+    ``url`` is the address that robots connect to, "" until they can; ``port`` is its port.  ``status_port``
+    is the operator's port of the control plane on loopback.  ``launched`` is the highest number N of a
+    server's name ``server-N`` so far.  ``control_token_file`` is "" if the control ports require no token.
+    ``lan`` is the address at which other machines connect, "" if none can; ``authority_file`` is then the
+    certificate of the authority that they trust.
     """
 
     name: str
@@ -81,22 +82,22 @@ class PlatformState:
     authority_file: str = ""
 
     def processes(self) -> tuple[ProcessMark, ...]:
-        """Return all processes but the control plane."""
+        """Return all processes of the platform except for the control plane."""
         balancer = () if self.load_balancer is None else (self.load_balancer,)
         return (*(server.process for server in (*self.servers, *self.single_servers)), *balancer)
 
     @property
     def single_servers(self) -> tuple[ServerState, ...]:
-        """Data server and rosbridge server, if they exist."""
+        """The data server and the rosbridge server, as far as they exist."""
         both = (self.data_server, self.rosbridge_server)
         return tuple(server for server in both if server is not None)
 
     def write(self, folder: Path) -> None:
-        """Replace the file in *folder* in one step."""
+        """Replace the state file in *folder* in one step."""
         replace_file(state_file(folder), self.to_json())
 
     def to_json(self) -> str:
-        """Return the content of the file."""
+        """Return the content of the state file."""
         document = asdict(self)
         for name in _OPTIONAL:
             if not document[name]:
@@ -105,14 +106,20 @@ class PlatformState:
 
 
 class PlatformLock:
-    """At most one control plane per folder; Linux releases the lock however its holder ends."""
+    """The lock that lets at most one control plane use a folder.
+
+    Linux releases it when the process that holds it exits, for whatever reason.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / _LOCK
         self._fd = -1
 
     def take(self, name: str) -> None:
-        """Take the lock; raises ConfigurationError when a platform called *name* holds it."""
+        """Take the lock; raises ConfigurationError if another process holds it.
+
+        *name* is the platform's name in the error message.
+        """
         fd = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -125,14 +132,18 @@ class PlatformLock:
         self._fd = fd
 
     def release(self) -> None:
-        """Release the lock."""
+        """Release the lock, if it was taken."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
 
 def state_folder(name: str, environment: Mapping[str, str]) -> Path:
-    """Return the folder of the platform called *name*; it need not exist.
+    """Return the state folder of the platform called *name*; it need not exist.
+
+    Args:
+        name: Name of the platform.
+        environment: Environment variables, of which XDG_STATE_HOME and HOME count.
 
     Raises:
         UsageError: The name is not made of 1 to 32 lower-case letters, digits and hyphens.
@@ -148,17 +159,20 @@ def state_folder(name: str, environment: Mapping[str, str]) -> Path:
 
 
 def control_token_file(folder: Path) -> Path:
-    """Return the file of the token of the control ports."""
+    """Return the path of the token that the control ports of the platform in *folder* require."""
     return folder / "control.token"
 
 
 def recording_key_file(folder: Path) -> Path:
-    """Return the file of the key of pseudonyms, which is there while the platform records."""
+    """Return the path of the key with which recordings replace names by pseudonyms.
+
+    The file exists while the platform records; its servers then get it as --record-key.
+    """
     return folder / "recording.key"
 
 
 def settings_file(folder: Path) -> Path:
-    """Return the file of the settings that the servers read."""
+    """Return the path of the settings that the servers of the platform in *folder* read."""
     return folder / "settings.json"
 
 
@@ -179,15 +193,17 @@ def platform_settings(folder: Path) -> PlatformSettings | None:
 
 
 def state_file(folder: Path) -> Path:
-    """Return the file that says what runs in *folder*."""
+    """Return the path of the state file of the platform in *folder*."""
     return folder / _FILE
 
 
 def read_state(folder: Path) -> PlatformState | None:
-    """Return the state of the platform in *folder*; None if it does not run.
+    """Return the content of the state file in *folder*; None if there is no such file.
+
+    A platform whose processes were all killed may have left the file.
 
     Raises:
-        ConfigurationError: The file is there, but is not readable.
+        ConfigurationError: The file cannot be read, or is damaged.
     """
     path = folder / _FILE
     try:
@@ -201,24 +217,27 @@ def read_state(folder: Path) -> PlatformState | None:
 
 
 def remove_state(folder: Path) -> None:
-    """Remove the state file, but neither key nor logs."""
+    """Remove the state file in *folder*, if it exists; keys and logs stay."""
     (folder / _FILE).unlink(missing_ok=True)
 
 
 def stop_platform(folder: Path, timeout_s: float = STOP_TIMEOUT_S) -> bool:
-    """End the platform in *folder*, waiting *timeout_s* for each step; return whether anything ran.
+    """Stop all processes of the platform in *folder*; return whether any ran.
 
-    The control plane is asked first and ends its servers itself; then whatever is left is ended here, also
-    if the control plane was killed.  Only processes whose id and start time are in the file are signalled.
+    The control plane gets SIGTERM first, and stops its servers itself.  Processes that then still run, also
+    those of a control plane that was killed, get SIGINT.  A process that has not exited after *timeout_s*
+    (the control plane: three times that) is killed.  Only processes whose id and start time are in the state
+    file are signalled; the file is removed.
 
     Raises:
-        ConfigurationError: The state file is there, but is not readable.
+        ConfigurationError: The state file cannot be read, or is damaged.
     """
     state = read_state(folder)
     if state is None:
         return False
     ran = send_signal(state.control_plane, signal.SIGTERM)
-    # It gives servers and balancer their time, one after the other.
+    # The control plane waits for the rosbridge server, the other servers and the balancer, one after the
+    # other.
     if ran and not wait_ended(state.control_plane, 3 * timeout_s):
         send_signal(state.control_plane, signal.SIGKILL)
         wait_ended(state.control_plane, timeout_s)

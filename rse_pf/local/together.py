@@ -1,4 +1,4 @@
-"""Wait for several coroutines at once, as a task group of Python 3.11 does."""
+"""Run several coroutines concurrently and wait for all, as a task group of Python 3.11 does."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ __all__ = ["run_together"]
 
 
 async def run_together(*works: Coroutine[Any, Any, Any]) -> None:
-    """Wait for all of *works*; after a failure or a cancellation, end the others, too.
+    """Run the coroutines *works* concurrently, and wait until all are done.
+
+    If one of them fails, or the caller is cancelled, all others are cancelled and waited for.
 
     Raises:
-        BaseException: What the first of them that failed raised.
+        BaseException: The exception of the coroutine that failed first.
     """
     tasks = [asyncio.ensure_future(work) for work in works]
     try:

@@ -1,7 +1,8 @@
 """The load balancer box on one machine: a real Envoy, which is never restarted while it runs.
 
-Only its endpoint file changes, by atomic rename, so open sockets stay open whatever the targets do.  The
-caller chooses the targets; Envoy's own checks decide which of them are healthy.
+Only the endpoint files, which list the targets, change while Envoy runs, by atomic rename; a change of
+targets therefore closes no connection.  The caller chooses the targets; Envoy's own checks decide which are
+healthy.
 """
 
 from __future__ import annotations
@@ -37,20 +38,22 @@ from rse_pf.storage.files import replace_file, replace_json
 
 __all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
 
-_ASK_S = 1.0
-_LOOK_AGAIN_S = 0.01
+# Time limit of one request to Envoy's admin page, in seconds.
+_ADMIN_TIMEOUT_S = 1.0
+# Pause between two requests to the admin page while a state of Envoy is waited for, in seconds.
+_POLL_S = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetStats:
-    """One target as Envoy reports it."""
+    """One backend server as Envoy reports it: whether Envoy sends it robots, and how many are connected."""
 
     healthy: bool
     robots: int
 
 
 def envoy_binary() -> str:
-    """Return the path of the Envoy program; raises MissingExtra."""
+    """Return the path of the Envoy program; raises MissingExtra if its package is not installed."""
     try:
         import envoy
     except ImportError as error:
@@ -59,7 +62,11 @@ def envoy_binary() -> str:
 
 
 class EnvoyLoadBalancer:
-    """One Envoy.  Its ports are 0 before `wait_live`; its admin page is a socket file for this user only."""
+    """One Envoy process, and the files that it reads.
+
+    ``port`` and ``loopback_port`` are 0 before `wait_live`.  Envoy's admin page is on a socket file that only
+    this user can open.
+    """
 
     def __init__(
         self,
@@ -71,19 +78,21 @@ class EnvoyLoadBalancer:
         write: Callable[[Path, str], None] = replace_file,
         lan: LanListener | None = None,
     ) -> None:
-        """Describe one; nothing is started.
+        """Store what Envoy is started with; nothing is started.
 
         Args:
-            settings: Limits of connections and requests.
-            folder: Of its files and its log.
-            port: Where robots connect; 0 takes a free one.
-            dies_with_parent: Whether it ends with this process.
-            write: Replaces a list of targets by a text.
-            lan: Where it listens instead of loopback, with TLS; its files are there before `launch`.
+            settings: What `envoy_config` reads.
+            folder: Folder of Envoy's configuration, endpoint files, admin socket and log.
+            port: Port to which robots connect; 0 takes a free one.
+            dies_with_parent: Whether Linux kills Envoy when this process exits.
+            write: Called with the path and the new content of an endpoint file, which it replaces in one
+                step.
+            lan: Address and certificate at which Envoy listens in place of loopback; the certificate's file
+                must exist before `launch`.
         """
         self.port = 0
         self.loopback_port = 0
-        """Where the rosbridge server connects; 0 without one."""
+        """Port of the listener without TLS that the rosbridge server connects to; 0 if there is none."""
         self.process = ServerProcess("load-balancer", folder)
         self._settings = settings
         self._folder = folder
@@ -98,18 +107,20 @@ class EnvoyLoadBalancer:
         self._write = write
 
     def launch(self) -> None:
-        """Start the process without targets, and return before it listens.
+        """Start Envoy, and return before it listens.
 
-        After an earlier one, it takes the same port and the same targets.
+        The first Envoy has no targets.  One that is started after another has exited takes the same ports and
+        the same targets.
 
         Raises:
-            ConfigurationError: Its configuration cannot be written.
+            ConfigurationError: Envoy's configuration cannot be written.
+            MissingExtra: Envoy is not installed.
         """
         binary = envoy_binary()
         if self.process.mark is None:
             for cluster in self._endpoints:
                 self.set_targets((), cluster)
-        self.process.kill()  # reaps one that ended by itself
+        self.process.kill()  # reaps an earlier Envoy that exited by itself
         self._wanted_port = self.port or self._wanted_port
         config = self._folder / "envoy.json"
         (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
@@ -130,14 +141,17 @@ class EnvoyLoadBalancer:
         self.process.start(command, dies_with_parent=self._dies_with_parent)
 
     def adopt(self, mark: ProcessMark | None, *, port: int) -> None:
-        """Take over the balancer of an earlier control plane, which may have ended, with its port."""
+        """Take over the Envoy that an earlier control plane started, and the *port* to which robots connect.
+
+        With *mark* None that Envoy has exited; the next `launch` then takes *port*, without targets.
+        """
         self.process.mark, self.port = mark, port
 
     async def wait_live(self, timeout_s: float) -> None:
-        """Wait until Envoy listens; sets ``port`` and ``loopback_port``.
+        """Wait until Envoy listens, at most *timeout_s*, and set ``port`` and ``loopback_port``.
 
         Raises:
-            ConfigurationError: Envoy ended, or did not listen in time.
+            ConfigurationError: Envoy exited, or did not listen in time.
         """
 
         async def live() -> bool:
@@ -157,15 +171,18 @@ class EnvoyLoadBalancer:
             raise self.process.failed(late if self.process.is_running() else self.process.ending())
 
     def set_targets(self, targets: Sequence[Target], cluster: str = CLUSTER) -> None:
-        """Let new sockets of *cluster* go to *targets* and nowhere else; open sockets stay where they are."""
+        """Send new connections of *cluster* to *targets* only; open connections stay where they are."""
         self._write(self._endpoints[cluster], json.dumps(endpoints(targets, cluster)))
 
     async def stats(self) -> Mapping[str, TargetStats]:
-        """Return the targets that Envoy has now, by server name; empty when it does not answer."""
+        """Return Envoy's present targets among the backend servers, by name; empty if Envoy is silent."""
         return _targets(json.loads(await self._get("/clusters?format=json") or b"{}"))
 
     async def wait_healthy(self, names: Iterable[str], timeout_s: float) -> bool:
-        """Wait until Envoy gives robots to every one of *names*; return whether it does."""
+        """Wait until Envoy finds every backend server of *names* healthy, and return True.
+
+        False after *timeout_s*, or if Envoy exits before.
+        """
         expected = set(names)
 
         async def healthy() -> bool:
@@ -174,7 +191,10 @@ class EnvoyLoadBalancer:
         return await self._wait_until(healthy, timeout_s)
 
     async def wait_gone(self, name: str, timeout_s: float) -> bool:
-        """Wait until Envoy has dropped *name* from its targets; return whether that is certain."""
+        """Wait until Envoy no longer has the backend server *name* as a target, and return True.
+
+        False after *timeout_s*, or if Envoy exits before; new robots may then still be sent to *name*.
+        """
 
         async def gone() -> bool:
             page = await self._get("/clusters?format=json")
@@ -183,31 +203,34 @@ class EnvoyLoadBalancer:
         return await self._wait_until(gone, timeout_s)
 
     async def wait_over(self) -> str:
-        """Wait until the process ends by itself; return the last line of its log."""
+        """Wait until Envoy exits; return the last line that it logged, "" if there is none."""
         await self.process.wait_over()
         return self.process.last_line()
 
     async def stop(self, timeout_s: float) -> None:
-        """End the process, which cuts every socket; kill it after *timeout_s*."""
+        """Stop Envoy with SIGTERM, which cuts every connection, and kill it if it runs after *timeout_s*."""
         await self.process.stop(signal.SIGTERM, timeout_s)
 
     def kill(self) -> None:
-        """End the process at once, if it is there, and reap it."""
+        """Kill Envoy, if it runs, and reap it."""
         self.process.kill()
 
     async def _wait_until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
-        """Ask *condition* until it holds, the time is over, or Envoy has ended."""
+        """Await *condition* again and again until it is true, and return True.
+
+        False after *timeout_s*, or once Envoy has exited.
+        """
         end = time.monotonic() + timeout_s
         while self.process.is_running():
             if await condition():
                 return True
             if time.monotonic() >= end:
                 return False
-            await asyncio.sleep(_LOOK_AGAIN_S)
+            await asyncio.sleep(_POLL_S)
         return False
 
     async def _get(self, path: str) -> bytes:
-        return await asyncio.to_thread(_ask, self._folder, path)
+        return await asyncio.to_thread(_read_admin_page, self._folder, path)
 
 
 def _targets(page: Mapping[str, Any]) -> dict[str, TargetStats]:
@@ -219,6 +242,10 @@ def _targets(page: Mapping[str, Any]) -> dict[str, TargetStats]:
 
 
 def _target(host: Mapping[str, Any]) -> tuple[str, TargetStats]:
+    """Return name and state of one target on the page /clusters.
+
+    A target is healthy unless Envoy marks it as failed or pending, or its endpoint file as unhealthy.
+    """
     robots = [int(s.get("value", 0)) for s in host.get("stats", []) if s.get("name") == "rq_active"]
     health = host.get("health_status", {})
     failed = {name for name, value in health.items() if name.startswith(("failed_", "pending_")) and value}
@@ -227,16 +254,19 @@ def _target(host: Mapping[str, Any]) -> tuple[str, TargetStats]:
 
 
 class _Admin(http.client.HTTPConnection):
-    """HTTP over the socket file in *folder*."""
+    """A connection to Envoy's admin page over the socket file in *folder*."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__("admin", timeout=_ASK_S)
+        super().__init__("admin", timeout=_ADMIN_TIMEOUT_S)
         self._folder = folder
 
     def connect(self) -> None:
-        """Connect by the folder's descriptor: an address of a socket file has at most 107 bytes."""
+        """Connect to the socket file through a descriptor of its folder.
+
+        The path of a socket file may have at most 107 bytes, and that of the folder may be longer.
+        """
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(_ASK_S)
+        self.sock.settimeout(_ADMIN_TIMEOUT_S)
         folder = os.open(self._folder, os.O_PATH | os.O_DIRECTORY)
         try:
             self.sock.connect(f"/proc/self/fd/{folder}/{ADMIN_SOCKET}")
@@ -244,8 +274,8 @@ class _Admin(http.client.HTTPConnection):
             os.close(folder)
 
 
-def _ask(folder: Path, path: str) -> bytes:
-    """Return what Envoy's admin page answers; nothing when it does not."""
+def _read_admin_page(folder: Path, path: str) -> bytes:
+    """Return the body of Envoy's admin page *path*; b"" if Envoy does not answer."""
     connection = _Admin(folder)
     try:
         connection.request("GET", path)

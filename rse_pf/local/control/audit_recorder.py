@@ -1,7 +1,6 @@
-"""The control plane's own audit log: what it started, stopped and moved.
+"""The audit log of the control plane of a local platform: what it started, stopped and moved.
 
-Every event of the platform becomes an entry.  A log that cannot be written neither delays nor ends the
-platform.
+Every event of the platform becomes an entry.  If the log cannot be written, the platform runs on undelayed.
 """
 
 from __future__ import annotations
@@ -18,27 +17,31 @@ __all__ = ["PlatformAudit"]
 
 
 class PlatformAudit:
-    """Records events of one control plane in its audit log; drops those before `open` and after `close`."""
+    """The audit log of one control plane; events before `open` and after `close` are not recorded."""
 
     def __init__(self, state: Path, *, on_problem: Callable[[str], None]) -> None:
-        """Open nothing yet; *on_problem* is called as `AuditLog` says."""
+        """Describe the log in the folder *state*; nothing is opened yet.
+
+        *on_problem* is called with a sentence, in any thread, when writing begins to fail, and when `close`
+        loses entries.
+        """
         self._is_open = False
         self._log = AuditLog(audit_folder(state), CONTROL_PLANE, wall_clock=time.time, on_problem=on_problem)
 
     def open(self) -> None:
-        """Begin to record; raises ConfigurationError."""
+        """Begin to record; raises ConfigurationError if the log cannot be written."""
         self._log.open().start()
         self._is_open = True
 
     def record(self, event: Mapping[str, Any]) -> None:
-        """Record one event of the platform."""
+        """Record one event of the platform as the action ``platform.EVENT`` on its server."""
         if self._is_open:
             detail = {name: _value(value) for name, value in event.items() if name not in ("event", "server")}
             action, subject = f"platform.{event['event']}", str(event.get("server", ""))
             self._log.record(action, subject, **detail)
 
     def close(self) -> None:
-        """Record the end."""
+        """Record that the platform has ended, and close the log."""
         if self._is_open:
             self._is_open = False
             self._log.record("platform.over")
@@ -46,6 +49,7 @@ class PlatformAudit:
 
 
 def _value(value: Any) -> Value:
+    """Return *value* as an entry may hold it: a list becomes words with commas, other objects become text."""
     if isinstance(value, list | tuple):
         return ",".join(map(str, value))
     return value if value is None or isinstance(value, str | int | float) else str(value)

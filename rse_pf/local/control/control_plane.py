@@ -1,8 +1,8 @@
 """The control plane of a local platform: monitor the servers, decide, act.
 
-Health checks, samples, the scale modifier, the rebalancing of robots and the restart of a lost balancer run
-here, in one event loop without threads.  Robots are served without it, too, and a check that the control
-plane itself delayed does not count against a server.
+Health checks, samples of the monitor, the scale modifier, the rebalancing of robots and the restart of a lost
+load balancer run here, in one event loop without threads.  While the control plane does not run, servers and
+load balancer still serve robots.  A health check that the control plane itself delayed is not counted.
 """
 
 from __future__ import annotations
@@ -41,18 +41,24 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["ControlOptions", "ControlPlane"]
 
-# Replacements within a minute of servers that ended soon after their start; further ones wait.
+# While this many replacements of any server were started within the last 60 s, a server that exited soon
+# after its start is not replaced: a release that cannot start (a crash loop) would otherwise take all the CPU
+# time.
 MAX_RESTARTS_PER_MINUTE = 5
-# Time limit of a request to move robots, in seconds.
+# Time limit of the request that asks a server to move robots, in seconds.
 _MOVE_TIMEOUT_S = 2.0
-# Time limit of reading a server's status, as a share of the time between two samples.
+# Time limit of reading a server's /status page, as a share of the time between two samples: a slow server
+# must not delay the next sample.
 _STATUS_SHARE = 0.5
-# A check that ends later than its time limit by this share of it was delayed by the control plane itself.
+# A health check that fails later than 1 + this many times its time limit was delayed by the control plane
+# itself.
 _LATE_SHARE = 0.5
+# States in which a server answers /readyz with a failure because it drains, and not because it is unhealthy.
 _LEAVING = frozenset({"draining", "leaving"})
-# Longest pause between two attempts to start the balancer, in seconds.
+# Longest pause between two attempts to start the load balancer, in seconds; each pause doubles the one
+# before.
 _MAX_PAUSE_S = 8.0
-# Time between two checks whether a standby is missing, in seconds.
+# Time between two checks whether a warm standby process is missing, in seconds.
 _STANDBY_EVERY_S = 1.0
 
 
@@ -60,10 +66,11 @@ _STANDBY_EVERY_S = 1.0
 class ControlOptions:
     """The automatic actions of a control plane.
 
-    With ``elastic``, monitor and scale modifier run, and what breaks is replaced; with ``rebalance``, too,
-    robots of crowded servers are asked to move.  ``compress`` is the factor by which periods, idle time,
-    warm-up and grace are shorter, for experiments.  ``on_sample`` gets each sample of the monitor, which then
-    runs in any case.
+    With ``elastic``, servers are started and drained by load, and servers and a load balancer that fail are
+    replaced; with ``elastic`` and ``rebalance``, robots of crowded servers are asked to move.  ``compress``
+    is the factor by which the periods of the monitor and the idle, warm-up and grace times are shortened, for
+    experiments.  ``on_sample`` is called with each sample of the monitor; with it the monitor runs also if
+    ``elastic`` is False.
     """
 
     elastic: bool = False
@@ -73,7 +80,11 @@ class ControlOptions:
 
 
 class ControlPlane:
-    """Monitor and scale modifier over one `Fleet`."""
+    """The loops that observe one `Fleet` and its load balancer, decide, and act.
+
+    ``sample`` is the newest sample of the monitor, None before the first.  While ``hold`` is True, servers
+    are only replaced: an operation of the operator changes their number.
+    """
 
     def __init__(
         self,
@@ -114,13 +125,16 @@ class ControlPlane:
         self._cores = len(os.sched_getaffinity(0))
 
     def start_checks(self) -> None:
-        """Check the health of every server from its announcement on."""
+        """Check the health of every server from its announcement on, unless neither loop is wanted."""
         if self._is_idle:
             return
         self._fleet.on_ready = lambda member: self._fleet.keep(self._check_periodically(member))
 
     def start(self) -> None:
-        """Start the monitor, and the scale modifier if elastic."""
+        """Start the monitor; if elastic, also the scale modifier and the watches of balancer and standby.
+
+        Nothing starts if the options ask for neither elastic operation nor samples.
+        """
         if self._is_idle:
             return
         self._fleet.on_healthy = self.watch_spread
@@ -132,36 +146,36 @@ class ControlPlane:
             self._act_soon()
 
     async def _keep_standby(self) -> None:
-        """Start a standby after every launch, once no server is starting."""
+        """Start a warm standby whenever there is none and no server has started lately."""
         while self._elastic:
             await asyncio.sleep(_STANDBY_EVERY_S)
             self._fleet.start_standby()
 
     def stop(self) -> None:
-        """Take no further action."""
+        """Start, drain and replace no server from now on; the monitor still takes samples."""
         self._elastic = False
 
     def retry_replacements(self) -> None:
-        """Replace now what had to wait."""
+        """Decide again soon: replacements may have waited for space on a full disk."""
         self._act_soon()
 
     def watch_spread(self) -> None:
-        """Watch for half a minute whether robots are spread evenly."""
+        """Watch for 30 s whether robots are spread evenly over the servers; nothing without rebalancing."""
         if self._rebalancer is not None:
             self._rebalancer.watch(time.monotonic())
 
     def document(self) -> dict[str, Any]:
-        """Return the state of the policy as plain JSON values."""
+        """Return the state of the scaling policy, and its samples, one a period, as plain JSON values."""
         samples = [
             {"start_s": sample.start_s, "cpu_percent": sample.cpu_percent, "requests": sample.requests}
             for sample in self._periods.samples(time.monotonic())
         ]
         return {**self.modifier.document(), "elastic": self._elastic, "samples": samples}
 
-    # --- health ----------------------------------------------------------------------------------
+    # --- periodic health checks of the servers ----------------------------------------------------
 
     async def _check_periodically(self, member: Member) -> None:
-        """Check */readyz* of one server periodically, as the balancer does."""
+        """Check */readyz* of *member* every `LOCAL_INTERVAL_S` until it leaves, is replaced or has exited."""
         assert member.server is not None
         port = self._fleet.control(member.server)
         try:
@@ -176,7 +190,11 @@ class ControlPlane:
             port.close()
 
     async def _check(self, member: Member, port: ControlPort, began_s: float) -> bool | None:
-        """Return the outcome of one check; None if it does not count for the server."""
+        """Return whether */readyz* answered 200 in time; None if the check does not count.
+
+        A check does not count if this process was late itself, or if the server drains: then its drain is
+        noted.
+        """
         try:
             reply = await port.ask(READY_PATH, timeout_s=LOCAL_TIMEOUT_S)
         except ConnectionError:
@@ -188,7 +206,10 @@ class ControlPlane:
         return reply.status == 200
 
     def _note_check(self, member: Member, ok: bool) -> None:
-        """Update the health of *member*; its clock is compressed, too, which shortens the grace period."""
+        """Update the health of *member* with one check; emit an event and act if it became unhealthy.
+
+        The times of `Health` run faster by the factor ``compress``, which shortens the grace period.
+        """
         health = member.health
         now_s = time.monotonic() * self._compress
         member.health = observe(health, ok, self.settings.health, now_s=now_s)
@@ -197,9 +218,10 @@ class ControlPlane:
             self._emit("server-unhealthy", server=member.name, reason=f"{failed} checks in a row failed")
             self._act_soon()
 
-    # --- samples --------------------------------------------------------------------------------
+    # --- samples of the monitor -------------------------------------------------------------------
 
     async def _monitor(self) -> None:
+        """Take a sample at each whole multiple of the sample interval on the monotonic clock."""
         try:
             while True:
                 now_s = time.monotonic()
@@ -262,7 +284,7 @@ class ControlPlane:
             member.robots = sample.robots
         return sample
 
-    # --- actions ---------------------------------------------------------------------------------
+    # --- actions of the scale modifier and the rebalancer -----------------------------------------
 
     def _act_soon(self) -> None:
         if self._elastic:
@@ -282,6 +304,7 @@ class ControlPlane:
             self._fleet.keep(self._move(request))
 
     async def _move(self, request: MoveRequest) -> None:
+        """Ask a server to move robots, and emit ``rebalance`` if it asks any to move."""
         member = self._fleet.members.get(request.server)
         if member is None or member.server is None:
             return
@@ -289,17 +312,17 @@ class ControlPlane:
         port = self._fleet.control(member.server)
         reply = await port.ask_once(target, timeout_s=_MOVE_TIMEOUT_S, method="POST")
         if reply is None or reply.status >= 300:
-            return  # the next sample asks again
+            return  # the next sample leads to another request
         answer = reply.document()
         if answer.get("robots"):
             self._emit(
                 "rebalance", server=request.server, robots=answer["robots"], spread_s=answer["spread_s"]
             )
 
-    # --- the balancer ----------------------------------------------------------------------------
+    # --- restart of a lost load balancer ----------------------------------------------------------
 
     async def _watch_balancer(self) -> None:
-        """Restart the balancer on its port whenever it has ended."""
+        """Start the load balancer again, on its port, whenever it has exited."""
         while True:
             why = await self._load_balancer.wait_over()
             began_s = time.monotonic()
@@ -313,6 +336,7 @@ class ControlPlane:
             self.watch_spread()
 
     async def _restart_balancer(self) -> None:
+        """Try to start the load balancer until it listens, with growing pauses."""
         pause_s = LOCAL_INTERVAL_S
         while True:
             try:
@@ -322,12 +346,16 @@ class ControlPlane:
             except ConfigurationError as error:
                 self._emit("balancer-failed", reason=error.message, wait_s=pause_s)
             await asyncio.sleep(pause_s)
-            # What waits for space starts as soon as there is some.
+            # While the disk is full the pause stays short, so that a start follows as soon as there is space.
             pause_s = LOCAL_INTERVAL_S if self._fleet.is_full() else min(2 * pause_s, _MAX_PAUSE_S)
 
 
 def _scheduled_minimum(scaling: ScalingSettings) -> Callable[[], int] | None:
-    """Return the minimum at the time of day, as a scheduled action sets it; None without a schedule."""
+    """Return a function that gives the scheduled ``min_servers`` of now; None if there is no schedule.
+
+    The times of day are those of ``scaling.time_zone``; where no entry of the schedule applies, the function
+    returns ``scaling.min_servers``.
+    """
     entries, zone = parse_schedule(scaling.schedule), zone_named(scaling.time_zone)
     if not entries:
         return None

@@ -1,9 +1,9 @@
-"""The pages and operations of the control plane on its `rse_pf.http.control_port`, on loopback.
+"""Serve the pages and operations of a local control plane over HTTP on loopback (`rse_pf.http.control_port`).
 
 ``GET /status`` is JSON, ``GET /metrics`` is for Prometheus; ``POST /drain?server=NAME`` and ``POST /roll``
 are answered with the events of the operation, one JSON object a line, until it is over; ``GET /watch`` with
-all events and states, in the same form, until the connection ends.  Every request needs the token of the
-control ports, and none may come from a web page.  A slow or malformed request ends its own connection only.
+all events and states, in the same form, until the connection closes.  Every request needs the token of the
+control ports, and none may come from a web page.  A slow or malformed request closes its own connection only.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ __all__ = ["METRICS_TYPE", "Page", "serve_control_port"]
 
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Page = Callable[[], Awaitable[tuple[str, bytes]]]
-"""Returns the media type and the body of a page."""
+"""A function that returns the media type and the body of a page; called for each request."""
 Operation = Callable[[Mapping[str, str]], AsyncGenerator[Mapping[str, Any], None]]
-"""Begins an operation with the parameters of the request, and returns its events; raises RsePfError.
+"""A function that begins an operation with the query parameters of the request, and returns its events.
 
-One that is asked with GET changes nothing, and goes on until the connection ends.
+It raises RsePfError if it refuses; the reply is then 409 with code, message and hint.  An operation for GET
+(a stream) changes nothing, and its events continue until the connection closes.
 """
 
 _LOOPBACK = "127.0.0.1"
@@ -40,18 +41,20 @@ async def serve_control_port(
     port: int = 0,
     first_request_s: float = FIRST_REQUEST_S,
 ) -> asyncio.Server:
-    """Listen on loopback; *pages* are asked with GET, *operations* with POST, by their paths.
+    """Listen on loopback, and answer requests by their path: pages and streams by GET, operations by POST.
+
+    A request without the token gets 401, one from a web page 403, another path 404, and another method 405.
 
     Args:
-        pages: By path; requested with GET.
-        operations: By path; requested with POST.
-        token: That every request must carry.
-        streams: Streams of events until the connection ends; requested with GET.
-        port: 0 takes a free one.
-        first_request_s: A connection whose request is not complete by then is cut.
+        pages: Function that makes each page, by path.
+        operations: Function that begins each operation, by path.
+        token: Token that every request must carry as its bearer.
+        streams: Functions that begin a stream of events, by path; None means no streams.
+        port: Port to listen on; 0 takes a free one.
+        first_request_s: Seconds after which a connection whose first request is incomplete is closed.
 
     Raises:
-        OSError: Something else listens on *port*.
+        OSError: Another program listens on *port*.
     """
 
     async def answer(ask: ControlRequest) -> ControlReply:
@@ -73,6 +76,7 @@ async def serve_control_port(
 
 
 def _begin(operation: Operation, query: Mapping[str, str]) -> ControlReply:
+    """Return the reply that streams the events of *operation*, or 409 with the error if it refuses."""
     try:
         events = operation(query)
     except RsePfError as error:

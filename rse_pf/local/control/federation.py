@@ -1,7 +1,7 @@
-"""The metrics of all servers as one page for Prometheus, and the file by which Prometheus finds the servers.
+"""Make one page for Prometheus of the metrics of all servers, and the file by which it finds the servers.
 
-Every sample gets the label ``server``.  A server that does not answer is missing from the page, except for
-``rse_pf_server_up``, which is 0 for it.  The space on the disks of the platform is on the page, too.
+Every sample gets the label ``server``.  Of a server that does not answer the page has ``rse_pf_server_up``
+alone, with the value 0.  The page also has the free and total space of the platform's disks.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ def federate_pages(pages: Mapping[str, str | None], disks: Sequence[Mapping[str,
     """Return one page in the text format of Prometheus.
 
     Args:
-        pages: The page of each server by its name; None if it did not answer.
-        disks: Folder, free and total bytes of each file system that the platform writes to.
+        pages: Text of the metrics page of each server, by name; None for a server that did not answer.
+        disks: One mapping for each file system that the platform writes to, with the keys ``folder``,
+            ``free_bytes`` and ``total_bytes``.
 
     Raises:
         MissingExtra: ``prometheus_client`` is not installed.
@@ -69,7 +70,10 @@ def federate_pages(pages: Mapping[str, str | None], disks: Sequence[Mapping[str,
 
 
 def service_discovery(platform: str, servers: Iterable[ServerState]) -> str:
-    """Return the file for ``file_sd_configs``: the control ports of *servers* that are ready."""
+    """Return the JSON text of a file for ``file_sd_configs`` of Prometheus.
+
+    It has one target, the control port on loopback, for each server that has announced its port.
+    """
     groups = [
         {
             "targets": [f"{_LOOPBACK}:{server.control_port}"],

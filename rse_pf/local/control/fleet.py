@@ -1,8 +1,8 @@
-"""The servers of one local platform in operation, each from its launch until its process is gone.
+"""The backend servers of one local platform, each from its launch until its process has exited.
 
-The fleet decides which servers may get robots, emits every change as an event, and carries out launches,
-drains and replacements that others decide.  A server that is to drain is removed from the balancer's targets
-before it is asked to, and a name is never used twice.
+The fleet decides which servers may get robots, emits every change as an event, and carries out the launches,
+drains and replacements that the scale modifier and operations decide.  A server is removed from the load
+balancer's targets before it is asked to drain, and no two servers of a platform get the same name.
 """
 
 from __future__ import annotations
@@ -28,29 +28,36 @@ from rse_pf.scaling.health import Health, time_to_notice_s
 
 __all__ = ["Fleet", "FleetReports", "Member", "ServerHealth"]
 
-# Time limit of a request to drain, in seconds.
+# Time limit of the request that asks a server to drain, in seconds.
 _DRAIN_REQUEST_S = 2.0
-# Longest wait for the balancer's answer before the state of the server is read again, in seconds.
-_LOOK_UP_S = 0.5
-# Pause between two such waits, in seconds.
+# Longest wait until the load balancer finds a new server healthy, in seconds; then it is looked at again
+# whether that server has exited or leaves, and the wait begins again.
+_HEALTHY_WAIT_S = 0.5
+# Pause between two such waits for the load balancer, in seconds, which may itself be restarting.
 _PAUSE_S = 0.02
-# Time after which tasks that did not end are cancelled again, in seconds.
+# Time after which tasks that still run are cancelled again, in seconds.
 _CANCEL_AGAIN_S = 0.2
-# A standby starts when no server became healthy for this long, in seconds, so that it delays no start.
+# A warm standby starts once every server has been healthy for this long, in seconds, so that its imports do
+# not delay the start of a server.
 _CALM_S = 3.0
 _PREFIX = "server-"
-# A server that ends sooner after it became healthy, in seconds, counts in `MAX_RESTARTS_PER_MINUTE`.
+# A server that exits less than this after it became healthy, in seconds, or before that, has ended early:
+# such replacements are limited by `MAX_RESTARTS_PER_MINUTE`.
 _MIN_UPTIME_S = 10.0
 
 
 @dataclass(slots=True, kw_only=True)
 class Member:
-    """One server.
+    """One backend server, from its launch until its process has exited.
 
-    ``leaving``: it drains; ``out``: it was replaced and is killed; ``on_trial``: it was started by a roll,
-    and is not replaced until it was healthy.
+    ``server`` is None until the process has announced itself.  ``leaving``: it drains.  ``out``: another
+    server replaces it, and it is killed.  ``on_trial``: a roll started it, and nothing replaces it before it
+    was healthy once.  ``replaces_living``: it replaces a server whose process still ran, and is not healthy
+    yet.  ``adopted``: an earlier control plane launched it.  ``robots`` and ``observed`` are from the last
+    sample.
 
-    Times are monotonic seconds; those of ``health`` are compressed with the rest.
+    The events ``healthy`` and ``over`` are set when it becomes healthy and when its process has exited.
+    ``launched_s`` and ``healthy_s`` are monotonic seconds; those of ``health`` run faster by ``compress``.
     """
 
     name: str
@@ -70,7 +77,7 @@ class Member:
 
     @property
     def phase(self) -> ServerPhase:
-        """The state as it is in a sample."""
+        """The state of this server, as samples of the monitor name it."""
         if self.leaving:
             return "draining"
         if self.out or self.health.state == "unhealthy":
@@ -82,9 +89,11 @@ class Member:
 class ServerHealth:
     """Numbers and names of servers by state.
 
-    ``servers`` counts all that exist or should: those that start, serve, fail their checks or ended
-    unexpectedly, but not those that drain.  ``broken`` run but fail their checks; ``dead`` have ended,
-    each with whether it ended soon after its start.  ``replacing`` counts replacements that do not serve yet.
+    ``servers`` counts all servers that exist or should: those that start, serve, fail their checks or exited
+    unexpectedly, but not those that drain.  ``warming`` counts servers whose CPU time does not count yet.
+    ``broken`` names servers that run but fail their checks.  ``dead`` maps the name of each server that has
+    exited to whether it did so soon after its start.  ``replacing`` counts servers that start in place of one
+    that still ran.
     """
 
     servers: int
@@ -97,14 +106,21 @@ class ServerHealth:
 
 @dataclass(frozen=True, slots=True)
 class FleetReports:
-    """Callbacks: *emit* takes an event with details, *changed* writes the state file."""
+    """Callbacks of the platform.
+
+    ``emit(event, **details)`` reports an event; ``changed()`` writes the state file.
+    """
 
     emit: Callable[..., None]
     changed: Callable[[], None]
 
 
 class Fleet:
-    """The members, by name."""
+    """The backend servers of one platform.
+
+    ``members`` has the servers whose processes run or start, by name; ``dead`` those that exited and are not
+    replaced yet, with whether each ended early; ``launched`` is the highest number of a server's name.
+    """
 
     def __init__(
         self,
@@ -115,7 +131,7 @@ class Fleet:
         compress: float,
         reports: FleetReports,
     ) -> None:
-        """Make a fleet without members."""
+        """Make a fleet without servers; *compress* divides the warm-up time and the wait for a standby."""
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
         self.launched = 0
@@ -128,16 +144,19 @@ class Fleet:
         self._emit = reports.emit
         self._changed = reports.changed
         self.is_full: Callable[[], bool] = lambda: False
-        """Return whether the disk is full; no server is launched then, since it could not announce itself."""
+        """Return whether the disk is full; then no server is launched, since it could not announce itself."""
         self._tasks: set[asyncio.Task[Any]] = set()
         self._still_targets: set[str] = set()
         self.on_ready: Callable[[Member], None] = lambda member: None
+        """Called with each server that has announced itself."""
         self.on_healthy: Callable[[], None] = lambda: None
+        """Called when the load balancer begins to send robots to a server."""
         self.on_lost: Callable[[], None] = lambda: None
+        """Called when a server has to be replaced because it exited or drains unasked."""
 
     @property
     def serving(self) -> tuple[BackendServer, ...]:
-        """The servers that have announced themselves and neither ended nor are to leave."""
+        """The servers that may get robots: announced, not exited, and neither draining nor replaced."""
         return tuple(
             member.server
             for member in self.members.values()
@@ -145,7 +164,7 @@ class Fleet:
         )
 
     def member(self, name: str) -> Member:
-        """Return the member called *name*; raises UsageError."""
+        """Return the server called *name*; raises UsageError if none is running."""
         if name not in self.members:
             running = ", ".join(self.members) or "none"
             raise UsageError(f"no server named {name!r} is running", hint=f"running are {running}")
@@ -156,15 +175,22 @@ class Fleet:
         return self._backend_servers.control(server.control_port)
 
     def is_warming(self, member: Member, now_s: float) -> bool:
-        """Return whether the CPU of *member* does not count yet: it counts some time after it took robots."""
+        """Return whether *member* is in its warm-up, in which its CPU time does not count for scaling.
+
+        The warm-up lasts until ``scaling.warm_up_s`` (compressed) after the server became healthy; an adopted
+        server has none.
+        """
         if member.adopted:
             return False
         return member.healthy_s is None or now_s - member.healthy_s < self._warm_up_s
 
-    # --- from the launch to the first robot -----------------------------------------------------
+    # --- start of a server: from the launch until the balancer sends it robots --------------------
 
     def launch(self, *, replaces_living: bool = False) -> Member:
-        """Start the process of a new server, and return before it listens; `bring_up` must follow."""
+        """Start the process of a new server, and return before it listens.
+
+        The caller must call `start` or `bring_up` with the server that is returned.
+        """
         self.launched += 1
         name = f"{_PREFIX}{self.launched}"
         now_s = time.monotonic()
@@ -182,10 +208,11 @@ class Fleet:
         return member
 
     def adopt(self, name: str, *, now_s: float, is_target: bool) -> Member:
-        """Take over a server of an earlier control plane; `bring_up` must follow.
+        """Take over the server *name* of an earlier control plane; the caller must `start` it.
 
-        Its health checks count at once, without the grace period of a new server.  The targets of the
-        balancer stay unchanged until every server that *is_target* has been adopted.
+        Its failed health checks count at once, without the grace period of a new server.  The targets of the
+        load balancer stay unchanged until every adopted server that *is_target* of the balancer now has been
+        brought up.
         """
         number = name.removeprefix(_PREFIX)
         self.launched = max(self.launched, int(number) if number.isdigit() else 0)
@@ -196,10 +223,14 @@ class Fleet:
         return member
 
     async def bring_up(self, member: Member, timeout_s: float) -> None:
-        """Wait until robots are sent to *member*.
+        """Wait until *member* has announced itself, make it a target, and wait until robots are sent to it.
+
+        Each of the two waits takes *timeout_s* at most.  Returns early, without an error, if the server
+        leaves, is replaced or exits after its announcement.
 
         Raises:
-            ConfigurationError: It ended, did not announce itself, or the balancer found it unhealthy.
+            ConfigurationError: The server exited or did not announce itself, and was killed; or the load
+                balancer did not find it healthy in time.
         """
         try:
             server = await self._backend_servers.wait_ready(member.name, timeout_s)
@@ -217,7 +248,7 @@ class Fleet:
         self._emit("server-ready", server=member.name, pid=server.pid, port=server.port)
         self.on_ready(member)
         while not member.over.is_set() and not member.leaving and not member.out:
-            left_s = min(end - time.monotonic(), _LOOK_UP_S)
+            left_s = min(end - time.monotonic(), _HEALTHY_WAIT_S)
             if await self._load_balancer.wait_healthy([member.name], max(left_s, 0.0)):
                 self._note_healthy(member, server)
                 return
@@ -228,7 +259,10 @@ class Fleet:
             await asyncio.sleep(_PAUSE_S)  # the balancer itself may be restarting
 
     def start_standby(self) -> None:
-        """Start a standby for the next launch, unless a server started less than 3 s ago."""
+        """Start a warm standby for the next launch if there is none, once no server starts or just started.
+
+        Every server must have been healthy for 3 s (compressed).
+        """
         calm_since_s = time.monotonic() - self._calm_s
         ready = (member.healthy_s for member in self.members.values())
         standby = self._backend_servers.standby
@@ -236,11 +270,15 @@ class Fleet:
             self._emit("standby-started", pid=standby.pid)
 
     def start(self, member: Member) -> None:
-        """Bring *member* up in the background; its failure is an event and a loss."""
+        """Bring *member* up in the background; if that fails, emit ``server-failed`` and count it as lost."""
         self.keep(self._start(member))
 
     async def wait_until_healthy(self, members: Iterable[Member], timeout_s: float) -> None:
-        """Wait until robots are sent to all of *members*; raises ConfigurationError if that fails."""
+        """Wait until robots are sent to all of *members*, at most *timeout_s* for each.
+
+        Raises:
+            ConfigurationError: A server exited, or did not become healthy in time.
+        """
         for member in members:
             either = [asyncio.ensure_future(event.wait()) for event in (member.healthy, member.over)]
             try:
@@ -253,10 +291,10 @@ class Fleet:
                     f"{member.name} did not become healthy", hint=f"look at the log {member.name}.log"
                 )
 
-    # --- what the scale modifier does ------------------------------------------------------------
+    # --- launches, drains and replacements that the scale modifier and operations decide ----------
 
     def standing(self, now_s: float) -> ServerHealth:
-        """Return the servers as the policy counts them."""
+        """Return numbers and names of the servers at *now_s* (monotonic), as the scaling policy counts."""
         there = [member for member in self.members.values() if not member.leaving and not member.out]
         return ServerHealth(
             servers=len(there) + len(self.dead),
@@ -270,7 +308,10 @@ class Fleet:
         )
 
     def grow(self, count: int, reason: str, *, on_trial: bool = False) -> Sequence[str]:
-        """Launch *count* servers at once; return their names."""
+        """Launch *count* servers and return their names at once; *reason* is not used.
+
+        With *on_trial*, a server that never becomes healthy is not replaced.
+        """
         members = [self.launch() for _ in range(count)]
         for member in members:
             member.on_trial = on_trial
@@ -278,7 +319,11 @@ class Fleet:
         return [member.name for member in members]
 
     def shrink(self, reason: str) -> str | None:
-        """Begin to drain the healthy server with the fewest robots; return its name."""
+        """Begin to drain the healthy server with the fewest robots; return its name.
+
+        Of servers with equally few robots, the one that was launched last.  None, and nothing happens, if
+        fewer than two servers are healthy.
+        """
         healthy = [member for member in self.members.values() if member.phase == "healthy"]
         if len(healthy) < 2:
             return None
@@ -288,9 +333,10 @@ class Fleet:
         return least.name
 
     def launch_replacement(self, name: str, reason: str) -> str:
-        """Launch a server in place of *name*; one that lives is cut off so that its robots go elsewhere.
+        """Launch a server in place of *name*, and return the new name.
 
-        One that leaves in order already is left alone.
+        If *name* still runs, it gets no new robots and is killed, so that its robots connect to other
+        servers.  If it drains already, its drain goes on.
         """
         self.dead.pop(name, None)
         member = self.members.get(name)
@@ -305,23 +351,28 @@ class Fleet:
         return new.name
 
     def withdraw(self, name: str) -> None:
-        """End the new server *name*, which did not become healthy; it is not replaced."""
+        """Kill the new server *name*, which did not become healthy; no server replaces it."""
         member = self.members.get(name)
         if member is not None:
             member.out = True
             self._set_targets()
             self._backend_servers.send(name, signal.SIGKILL)
 
-    # --- drain -----------------------------------------------------------------------------------
+    # --- the drain of one server ------------------------------------------------------------------
 
     def begin_drain(self, member: Member, reason: str) -> None:
-        """Send *member* no new robots."""
+        """Remove *member* from the load balancer's targets, and emit ``drain-start`` with *reason*."""
         member.leaving = True
         self._set_targets()
         self._emit("drain-start", server=member.name, reason=reason)
 
     async def finish_drain(self, member: Member, began_s: float) -> dict[str, Any]:
-        """Wait until the balancer has dropped it, let it move its robots, and wait until it has left."""
+        """Ask *member* to drain once the load balancer has removed it, wait until it has exited, and report.
+
+        A server that refuses to drain or takes too long is killed.  The report, also emitted as
+        ``drain-over``, has the name, the seconds since *began_s* (monotonic), and ``clean``: whether it
+        drained by itself.
+        """
         session = self.settings.session
         notice_s = time_to_notice_s(self.settings.health, local=True)
         if await self._load_balancer.wait_gone(member.name, STOP_TIMEOUT_S):
@@ -348,9 +399,10 @@ class Fleet:
         return report
 
     def note_own_drain(self, member: Member) -> None:
-        """Note that *member* drains although this control plane did not ask: it is replaced.
+        """Note that *member* drains although this control plane did not ask it to, and have it replaced.
 
-        An adopted server is not: the earlier control plane that asked it wanted one server less.
+        An adopted server is not replaced: the earlier control plane asked it to drain, to have one server
+        less.
         """
         if not member.leaving:
             self.begin_drain(member, "the server drains on another request")
@@ -359,23 +411,23 @@ class Fleet:
                 self.on_lost()
 
     def keep(self, work: Coroutine[Any, Any, Any]) -> None:
-        """Let *work* go on until it is done or the platform ends."""
+        """Run *work* as a task in the background, until it is done or `close` cancels it."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._finish_task)
 
     async def close(self) -> None:
-        """End everything that still waits; no process is touched.
+        """Cancel all background tasks and wait until none is left; no process is signalled.
 
-        Cancels until none is left: `asyncio.wait_for` before Python 3.12 loses a cancellation that comes
-        together with the result.
+        Tasks are cancelled again and again: `asyncio.wait_for` before Python 3.12 loses a cancellation that
+        comes together with the result.
         """
         while self._tasks:
             for task in self._tasks:
                 task.cancel()
             await asyncio.wait(self._tasks, timeout=_CANCEL_AGAIN_S)
 
-    # --- helpers ---------------------------------------------------------------------------------
+    # --- changes of one server's state ------------------------------------------------------------
 
     async def _start(self, member: Member) -> None:
         try:
@@ -388,7 +440,7 @@ class Fleet:
                 self._note_lost(member)
 
     def _note_healthy(self, member: Member, server: BackendServer) -> None:
-        """Note that the balancer found *member* healthy, by the same rule as `observe`."""
+        """Note that the load balancer found *member* healthy; its checks use the same limits as `observe`."""
         member.healthy_s = time.monotonic()
         if member.health.state == "starting":
             member.health = dataclasses.replace(member.health, state="healthy")
@@ -398,7 +450,10 @@ class Fleet:
         self.on_healthy()
 
     async def _watch(self, member: Member, server: BackendServer) -> None:
-        """Wait for the end of a server, and remove it from the targets and the members."""
+        """Wait until a server has exited, remove it from targets and members, and emit ``server-gone``.
+
+        If it neither drained nor was replaced, it counts as lost.
+        """
         code = await self._backend_servers.wait_over(server.name)
         unasked = not member.leaving and not member.out
         self._forget(member)
@@ -414,6 +469,7 @@ class Fleet:
         self._emit("server-gone", server=name, pid=pid, exit_code=exit_code, cause=cause)
 
     def _forget(self, member: Member) -> None:
+        """Remove *member*, whose process has exited, from the fleet, and set its event ``over``."""
         self._backend_servers.forget(member.name)
         self._still_targets.discard(member.name)
         self.members.pop(member.name, None)
@@ -421,6 +477,7 @@ class Fleet:
         self._changed()
 
     def _note_lost(self, member: Member) -> None:
+        """Have *member*, which exited, replaced, unless it is on trial."""
         if member.on_trial:
             return
         early_since_s = time.monotonic() - _MIN_UPTIME_S
@@ -429,6 +486,7 @@ class Fleet:
         self.on_lost()
 
     def _set_targets(self) -> None:
+        """Write the serving servers as targets of the balancer, unless adopted targets are not up yet."""
         if not self._still_targets:
             self._load_balancer.set_targets([server.target for server in self.serving])
         self._changed()

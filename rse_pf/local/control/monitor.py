@@ -1,10 +1,10 @@
 """The monitor box on one machine: samples of all servers, and their means over whole periods.
 
-A `MonitorSample` is taken about once a second; `Periods` combines them into the
-`rse_pf.scaling.rules.Sample`s that the policy evaluates, by the rule with which a report can be checked
-later: a sample stands for the time since the one before it, and belongs to the period in which the middle
-of that time lies.  The functions here are pure: they use no clock and no socket, and a server that does
-not answer has no numbers rather than zeros.
+A `MonitorSample` is taken about once a second; `Periods` combines those of a whole period into one
+`rse_pf.scaling.rules.Sample`, which the scaling policy evaluates.  A monitor sample stands for the time since
+the sample before it, and belongs to the period in which the middle of that time lies; the same rule checks a
+recorded run.  The functions here are pure: they use no clock and no socket.  The CPU load of a server that
+does not answer is None, not 0.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ ServerPhase = Literal["starting", "healthy", "unhealthy", "draining"]
 _MAX_INTERVAL_S = 1.0
 # Shortest time between two samples, in seconds: reading all servers more often would take noticeable CPU.
 _MIN_INTERVAL_S = 0.25
-# A period of which less than this share was observed gives no sample: most of its load is unknown.
+# A period gives no sample if the CPU load is known for less than this share of it.
 _MIN_OBSERVED_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observed:
-    """The /status page of a server as ``status``, and when it was read: ``at_s``, in monotonic seconds."""
+    """The content of a server's /status page as ``status``, read at ``at_s`` (monotonic seconds)."""
 
     at_s: float
     status: Mapping[str, Any]
@@ -48,7 +48,13 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerSample:
-    """One server.  Counts are of this interval; CPU is relative to its size, None when it did not answer."""
+    """One server in a `MonitorSample`.
+
+    ``requests``, ``bytes_in`` and ``bytes_out`` count since the sample before it; ``queue_ms`` is the longest
+    wait of a command in its queue in the last second or two.  ``cpu_percent`` is the CPU time that the server
+    used of what it may use; None unless it answered now and at least once before.  ``warming`` is whether its
+    CPU time does not count for scaling yet.
+    """
 
     name: str
     pid: int
@@ -66,10 +72,12 @@ class ServerSample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MonitorSample:
-    """All servers at one time.
+    """All servers at one time: ``time``, in monotonic seconds.
 
-    ``cpu_percent`` is the mean over the servers past their warm-up, None if there are none; 100 is all the
-    CPU time that a server may use (`capacity_cores`).
+    ``cpu_percent`` is the mean over the servers that are past their warm-up, None if no such server has a
+    value; 100 is all the CPU time that a server may use (`capacity_cores`).  ``healthy_servers`` counts those
+    that are healthy and get robots from the load balancer.  ``queue_ms`` is the largest of all servers, in
+    ms; robots, requests and bytes are sums over all servers.
     """
 
     time: float
@@ -94,7 +102,11 @@ def sample_interval_s(period_s: float) -> float:
 
 
 def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -> float:
-    """Return the CPU seconds per second that count as 100 % of a server."""
+    """Return the CPU seconds per second that count as 100 % of a server with *workers* worker processes.
+
+    These are the emulated cores of all workers if ``serving.emulated_cores`` is set, else one core for each
+    worker, at most *machine_cores*.
+    """
     if serving.emulated_cores > 0:
         return serving.emulated_cores * workers
     return float(min(workers, machine_cores))
@@ -103,13 +115,13 @@ def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -
 def server_sample(
     silent: ServerSample, before: Observed | None, now: Observed | None, *, capacity: float
 ) -> ServerSample:
-    """Return what a server did between *before* and *now*; None means that it did not answer.
+    """Return the sample of a server from its last two /status pages.
 
     Args:
-        silent: Its sample without an answer: name, pid, phase, and whether its CPU does not count yet.
-        before: Its last answer.
-        now: Its answer of this sample.
-        capacity: CPU seconds per second that are 100 %.
+        silent: The sample if the server does not answer: name, pid, phase and warm-up, all else 0 or None.
+        before: The server's last page before this sample; None if there is none yet.
+        now: The server's page of this sample; None if it did not answer, and *silent* is returned.
+        capacity: CPU seconds per second that count as 100 %.
     """
     if now is None:
         return silent
@@ -139,7 +151,7 @@ def server_sample(
 def monitor_sample(
     time_s: float, servers: Sequence[ServerSample], in_balancer: frozenset[str]
 ) -> MonitorSample:
-    """Return the sample of all *servers*; *in_balancer* are those the balancer sends robots to."""
+    """Return the sample of all *servers* at *time_s*; *in_balancer* names those that get new robots."""
     percents = [
         server.cpu_percent for server in servers if server.cpu_percent is not None and not server.warming
     ]
@@ -158,7 +170,10 @@ def monitor_sample(
 
 
 class Periods:
-    """Combines samples of the monitor into samples of whole periods, of which the newest *keep* stay."""
+    """Combines samples of the monitor into one sample for each period of *period_s* seconds.
+
+    Periods begin at whole multiples of *period_s* on the monotonic clock; the newest *keep* periods are kept.
+    """
 
     def __init__(self, period_s: float, keep: int) -> None:
         self._period_s = period_s
@@ -167,7 +182,10 @@ class Periods:
         self._before_s: float | None = None
 
     def add(self, sample: MonitorSample) -> bool:
-        """Add *sample*; return whether a period ended since the sample before it."""
+        """Add *sample*; return whether a period ended between the sample before it and *sample*.
+
+        The first sample, and one that is not newer than the last, only set the time; they return False.
+        """
         before_s, self._before_s = self._before_s, sample.time
         if before_s is None or sample.time <= before_s:
             return False
@@ -179,7 +197,10 @@ class Periods:
         return math.floor(sample.time / self._period_s) > math.floor(before_s / self._period_s)
 
     def samples(self, now_s: float) -> tuple[Sample, ...]:
-        """Return the samples of the periods that have ended by *now_s*, oldest first."""
+        """Return one sample for each period that has ended by *now_s*, oldest first.
+
+        Periods for most of which the CPU load is not known are left out.
+        """
         ended = math.floor(now_s / self._period_s + 1e-6)
         return tuple(
             _period_sample(period * self._period_s, period_samples)
@@ -189,7 +210,11 @@ class Periods:
 
 
 def _period_sample(start_s: float, period_samples: Sequence[tuple[float, MonitorSample]]) -> Sample:
-    """Return the sample of one period: means over time, and the sum of the requests."""
+    """Return the sample of the period that began at *start_s*.
+
+    CPU load and robots per server are means over the time for which the load is known; requests are a sum.
+    Each element of *period_samples* is the seconds that a monitor sample stands for, and that sample.
+    """
     loads = [(since_s, sample) for since_s, sample in period_samples if sample.cpu_percent is not None]
     known_s = _observed_s(period_samples)
     return Sample(
@@ -202,5 +227,5 @@ def _period_sample(start_s: float, period_samples: Sequence[tuple[float, Monitor
 
 
 def _observed_s(period_samples: Sequence[tuple[float, MonitorSample]]) -> float:
-    """Return for how many seconds of the period the CPU is known."""
+    """Return for how many seconds of a period the CPU load is known."""
     return sum(since_s for since_s, sample in period_samples if sample.cpu_percent is not None)

@@ -1,7 +1,7 @@
-"""Operations of a control plane that an operator requests: drain a server, or replace all, one by one.
+"""Operations that an operator requests of a control plane: drain, move robots, replace all servers (roll).
 
-An operation continues when the command that requested it has ended.  Only one runs at a time: two would drain
-each other's servers.
+An operation continues after the command that requested it has exited.  Only one runs at a time: two
+operations would drain each other's servers.
 """
 
 from __future__ import annotations
@@ -18,41 +18,47 @@ from rse_pf.errors import RsePfError, UsageError
 __all__ = ["FAILED", "OVER", "Operations"]
 
 Event = Mapping[str, Any]
-# Last event of an operation that succeeded.
+# Name of the last event that the requester of an operation gets if it succeeded.
 OVER = "operation-over"
-# Last event of an operation that failed.
+# Name of the last event that the requester of an operation gets if it failed.
 FAILED = "operation-failed"
 # Connections that may watch at the same time: a few pages and commands of one operator.
 _MAX_WATCHERS = 8
-# Events that wait for a slow watcher; newer ones are dropped, which their numbers show.
+# Events that are kept for a connection that reads slowly; newer ones are dropped, and gaps in the field
+# ``number`` show it.
 _MAX_WAITING_EVENTS = 1000
-# Time between two states, in seconds.
+# Time between two states of the platform that a watching connection gets, in seconds.
 _STATE_PERIOD_S = 1.0
-# Delay of a state after the full second, in seconds, at which the monitor takes its sample.
+# A state is sent this long after a full second of the monotonic clock, in seconds: at the full second the
+# monitor begins its sample, which the state should hold.
 _STATE_DELAY_S = 0.15
-# A state is sent again at most this many times in a second while the sample of the monitor is late.
+# If a state still holds the sample of the state before it, the next state follows at once, after
+# `_MIN_STATE_PERIOD_S`; at most this many times in a row.
 _MAX_LATE = 5
-# Delay of a state after an event, in seconds, and the shortest time between two states.
+# Shortest time between two states, in seconds, and the longest time from an event to the next state.
 _MIN_STATE_PERIOD_S = 0.1
 
 
 class Operations:
-    """The operations of one platform, and the events that they cause."""
+    """The operations of one platform, and the connections that receive its events."""
 
     def __init__(self, keep: Callable[[Coroutine[Any, Any, None]], None]) -> None:
-        """Run nothing yet; *keep* lets work go on until it is done or the platform ends."""
+        """Run nothing yet; *keep* runs a coroutine until it is done or the platform stops."""
         self._keep = keep
         self._listeners: set[Callable[[Event], None]] = set()
         self._running = ""
         self._watchers = 0
 
     def take_event(self, event: Event) -> None:
-        """Pass an event of the platform on to the commands that wait for an operation."""
+        """Pass an event of the platform on to the requester of an operation, and to all who watch."""
         for listener in list(self._listeners):
             listener(event)
 
     def begin(self, name: str, work: Callable[[], Coroutine[Any, Any, Any]]) -> AsyncGenerator[Event, None]:
-        """Start *work*, and return the events of the platform until it ended, and how that was.
+        """Run *work* in the background as the operation *name*, and return the events meanwhile.
+
+        The generator yields every event of the platform, and last `OVER`, or `FAILED` with message and hint.
+        The operation goes on if nobody reads it.
 
         Raises:
             UsageError: Another operation is under way.
@@ -68,9 +74,10 @@ class Operations:
         return self._yield_until_over(events)
 
     def watch(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
-        """Return the *state* of the platform once a second, and each event at once, without an end.
+        """Return a generator of what *state* returns, about once a second, and of each event at once.
 
-        A state comes as ``{"state": {...}}``; an event has ``time_s``, Unix time, and ``number``.
+        It has no end.  A state is yielded as ``{"state": {...}}``; an event has the further fields ``time_s``
+        (Unix time) and ``number`` (counted from 1 for this connection).
 
         Raises:
             UsageError: `_MAX_WATCHERS` connections watch already.
@@ -117,6 +124,7 @@ class Operations:
             self._listeners.discard(take)
 
     async def _run(self, work: Callable[[], Coroutine[Any, Any, Any]], events: asyncio.Queue[Event]) -> None:
+        """Run *work*, and put `OVER` or `FAILED` into *events* when it is done, fails or is cancelled."""
         last: Event = {"event": FAILED, "message": "the platform ends", "hint": ""}
         try:
             await work()

@@ -1,4 +1,4 @@
-"""The port of one running platform for its operator and for Prometheus, as `control_port` serves it."""
+"""The HTTP port on loopback at which an operator's commands and Prometheus reach one running platform."""
 
 from __future__ import annotations
 
@@ -21,48 +21,52 @@ from rse_pf.local.servers.control_client import ControlPort
 __all__ = ["OperatedPlatform", "OperatorPort"]
 
 Event = Mapping[str, Any]
-# Robots of one request to move: the default of `serving.max_robots`.
+# Most robots that one operation may move: the default of `serving.max_robots`.
 _MAX_MOVED = 10_000
-# Time over which these robots are asked to move, in seconds.
+# Time over which the robots of one operation are asked to move, in seconds, so that they do not reconnect at
+# once.
 _SPREAD_S = 1.0
-# Time limit of the request to the server, in seconds.
+# Time limit of the request that asks a server to move robots, in seconds.
 _MOVE_TIMEOUT_S = 2.0
 
 
 class OperatedPlatform(Protocol):
-    """The part of `LocalPlatform` that the port uses; `LocalPlatform` imports this module."""
+    """The part of `LocalPlatform` that this port uses.
+
+    A protocol, since `LocalPlatform` imports this module.
+    """
 
     @property
     def servers(self) -> Sequence[BackendServer]:
-        """The servers that take robots."""
+        """The servers that may get robots."""
 
     def status_document(self) -> dict[str, Any]:
         """Return the state of the platform as plain JSON values."""
 
     def check_drain(self, name: str) -> Any:
-        """Raise UsageError if *name* cannot be drained."""
+        """Raise UsageError if there is no server *name*, or it is the last one."""
 
     async def drain(self, name: str, reason: str = "asked") -> dict[str, Any]:
-        """Let *name* leave."""
+        """Have server *name* move its robots and exit; return the report of the drain."""
 
     def check_roll(self, settings: PlatformSettings) -> SettingsChange:
-        """Return what a roll with *settings* changes; raises UsageError."""
+        """Return what a roll with *settings* changes; raises UsageError if it can change nothing of it."""
 
     async def roll(self, change: SettingsChange | None = None) -> None:
-        """Replace every server; with *change*, the new ones have other settings."""
+        """Replace every server by a new one, which has the settings of *change* if it is given."""
 
     def kill(self, name: str) -> None:
-        """End *name* as a crash would; raises UsageError."""
+        """Kill server *name*, as a crash would end it; raises UsageError if there is none."""
 
     def pause(self, name: str) -> None:
-        """Stop the processes of *name*; raises UsageError."""
+        """Stop the processes of server *name* with SIGSTOP; raises UsageError if there is none."""
 
     def resume(self, name: str) -> None:
-        """Let a paused server go on; raises UsageError."""
+        """Continue the paused server *name*; raises UsageError if there is none."""
 
 
 class OperatorPort:
-    """The port, closed at first.  ``port`` is 0 while it is closed."""
+    """The port of one platform for its operator; closed until `open`."""
 
     def __init__(
         self,
@@ -73,14 +77,14 @@ class OperatorPort:
         keep: Callable[[Coroutine[Any, Any, None]], None],
         emit: Callable[..., None],
     ) -> None:
-        """Describe the port.
+        """Describe the port; nothing listens yet.
 
         Args:
-            platform: What it shows and operates.
-            metrics: Returns the page of a server for Prometheus, None if it does not answer.
+            platform: The platform that is shown and operated.
+            metrics: Returns the metrics page of a server for Prometheus; None if the server does not answer.
             disks: Returns the file systems of the platform, see `DiskWatch.document`.
-            keep: Lets work go on until it is done or the platform ends.
-            emit: Called with an event and its details.
+            keep: Runs a coroutine in the background until it is done or the platform stops.
+            emit: Called with the name of an event and its details as keywords.
         """
         self._platform = platform
         self._metrics_of = metrics
@@ -93,14 +97,18 @@ class OperatorPort:
 
     @property
     def port(self) -> int:
-        """Where it listens, on loopback."""
+        """The number of the port on loopback; 0 before `open`."""
         return 0 if self._server is None else int(self._server.sockets[0].getsockname()[1])
 
     async def open(self, token: str, *, ports: Sequence[int]) -> None:
-        """Listen on the first of *ports* that is free; 0 takes a free one.
+        """Listen on the first of *ports* that is free; the port number 0 takes any free one.
+
+        Args:
+            token: The token that every request must carry.
+            ports: Port numbers, in the order in which they are tried.
 
         Raises:
-            ConfigurationError: None is free.
+            ConfigurationError: None of *ports* is free.
         """
         pages = {"/status": self._status, "/metrics": self._metrics}
         operations: dict[str, Callable[[Mapping[str, str]], AsyncGenerator[Event, None]]] = {
@@ -124,7 +132,7 @@ class OperatorPort:
         )
 
     def close(self) -> None:
-        """Take no further request."""
+        """Accept no further connection; those that are open stay."""
         if self._server is not None:
             self._server.close()
 
@@ -158,6 +166,7 @@ class OperatorPort:
         return self._operations.begin("move", lambda: self._ask_to_move(name, port, robots))
 
     async def _ask_to_move(self, name: str, port: ControlPort, robots: int) -> None:
+        """Ask server *name* to move *robots*, and emit ``rebalance``; raises UsageError if it does not."""
         target = f"/move?robots={robots}&spread_s={_SPREAD_S:g}"
         reply = await port.ask_once(target, timeout_s=_MOVE_TIMEOUT_S, method="POST")
         answer = {} if reply is None else reply.document()
@@ -173,6 +182,7 @@ class OperatorPort:
     def _act_at_once(
         self, act: Callable[[str], None], query: Mapping[str, str]
     ) -> AsyncGenerator[Event, None]:
+        """Apply *act* to the server of the request, and return the event that it is done."""
         act(query.get("server", ""))
         return _yield_over()
 
@@ -185,7 +195,7 @@ async def _yield_over() -> AsyncGenerator[Event, None]:
 
 
 def _count(text: str) -> int:
-    """Return *text* as a number of robots; raises UsageError."""
+    """Return *text* as a number of robots, 1 to `_MAX_MOVED`; raises UsageError if it is none."""
     if not (text.isascii() and text.isdigit() and 0 < int(text[:6]) <= _MAX_MOVED):
         raise UsageError(f"{text[:20]!r} is no number of robots", hint=f"take one from 1 to {_MAX_MOVED}")
     return int(text[:6])

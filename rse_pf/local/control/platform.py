@@ -1,9 +1,9 @@
 """The whole platform on one machine: a real load balancer in front of real backend servers.
 
-``async with LocalPlatform(settings, state=folder) as platform`` starts everything that a demo, an
-experiment or a test needs.  Nothing that it started is left running, however the block ends,
-unless the platform is adoptable and was killed with SIGKILL.  It grows, shrinks and replaces servers by
-itself only if it is elastic.
+``async with LocalPlatform(settings, state=folder) as platform`` starts everything that a demo, an experiment
+or a test needs.  No process that it started runs on after the block, however the block is left; only those of
+an adoptable platform whose control plane was killed with SIGKILL do.  The platform starts, drains and
+replaces servers by itself only if it is elastic.
 """
 
 from __future__ import annotations
@@ -74,18 +74,21 @@ __all__ = ["LocalPlatform"]
 Event = Mapping[str, Any]
 
 _LOOPBACK = "127.0.0.1"
-# Time limit of a request to a server's control port, in seconds.
+# Time limit of reading the /status page of a server that is adopted, in seconds.
 _STATUS_TIMEOUT_S = 1.0
-# Newest events in the status document.
+# Number of the newest events that the status document holds.
 _LAST_EVENTS = 50
-# File for ``file_sd_configs`` of Prometheus, in the folder of the state file.
+# Name of the file for ``file_sd_configs`` of Prometheus, in the state folder.
 _TARGETS_FILE = "prometheus_sd.json"
-# Size above which a log is rotated; one rotated log is kept.
+# Size in bytes above which a log is rotated; one rotated log of each process is kept.
 _LOG_FILE_BYTES = 64 << 20
 
 
 class LocalPlatform:
-    """A local platform, started on entry and gone on exit."""
+    """A local platform: entering the context starts its processes, leaving it stops them.
+
+    ``url`` is the address that robots connect to, "" before the start; ``events`` all events so far.
+    """
 
     def __init__(
         self,
@@ -107,23 +110,24 @@ class LocalPlatform:
         """Describe a platform; nothing is started.
 
         Args:
-            settings: For the load balancer and for every server.
+            settings: Settings of the load balancer, the control plane and every server.
             state: Folder of keys, logs and ``platform.json``; created with mode 0700.
-            servers: How many servers start; None means ``local.servers``.  A number outside
-                ``scaling.min_servers`` and ``scaling.max_servers`` is a bound of the scale modifier, too.
+            servers: Number of backend servers at the start; None means ``local.servers``.  A number below
+                ``scaling.min_servers`` or above ``scaling.max_servers`` replaces that bound.
             port: Port that robots connect to, 0 takes a free one; None means ``local.port``.
-            name: Name of this platform for people; None means the name of the folder.
+            name: Name of this platform in messages and status; None means the name of the folder *state*.
             data: Whether robots get the data service under ``/data/``.
-            adoptable: Whether servers and balancer survive a control plane that is killed, and whether those
-                of an earlier one in *state* are adopted.
-            control: What the control plane does by itself; None means nothing.
-            on_event: Called with each event, at once.
-            program: The command that ``serve`` follows.
+            adoptable: Whether servers and load balancer run on if this process is killed, and whether those
+                that an earlier control plane left in *state* are taken over.
+            control: The automatic actions of the control plane; None means none.
+            on_event: Called with each event when it happens.
+            program: The command that starts a server when ``serve`` and its options are appended.
             lan: Address of this machine at which robots of its network connect, by TLS; empty means
                 ``serving.host``, which is loopback.
-            metrics_port: Port of the control plane on loopback: /metrics of all servers, /status; 0 takes a
-                free one, and so does a port that is taken, with the event ``metrics-port-taken``.
-            recorder: Records events, and samples of the monitor, which then runs in any case; None records
+            metrics_port: Port of the control plane on loopback, with /metrics of all servers and /status.  0
+                takes a free port; if the port is taken, a free one is used, with the event
+                ``metrics-port-taken``.
+            recorder: Records events and the samples of the monitor, which then always runs; None records
                 nothing.
         """
         control = control or ControlOptions()
@@ -163,7 +167,7 @@ class LocalPlatform:
         }  # fmt: skip
         self.data_servers = local_data_server(settings, store=store, **self._single_options)
         self._rosbridge: WatchedServer | None = None
-        """Made when the port of the balancer is known."""
+        """The rosbridge server; None without it, and until the port of the load balancer is known."""
         reports = FleetReports(emit=self._emit, changed=self._write_state)
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
@@ -181,31 +185,34 @@ class LocalPlatform:
 
     @property
     def servers(self) -> tuple[BackendServer, ...]:
-        """The servers that have announced themselves, and neither ended nor are to leave."""
+        """The backend servers that may get robots: announced, not exited, neither draining nor replaced."""
         return self._fleet.serving
 
     @property
     def metrics_url(self) -> str:
-        """Where Prometheus finds the metrics of all servers."""
+        """The address at which Prometheus reads the metrics of all servers."""
         return f"http://{_LOOPBACK}:{self._operator_port.port}/metrics"
 
     @property
     def port(self) -> int:
-        """The port that robots connect to."""
+        """The port that robots connect to; 0 before the load balancer listens."""
         return self.load_balancer.port
 
     @property
     def sample(self) -> dict[str, Any] | None:
-        """The newest sample of the monitor; None before the first."""
+        """The newest sample of the monitor, as plain JSON values; None before the first."""
         sample = self._control.sample
         return None if sample is None else sample.document()
 
     async def __aenter__(self) -> LocalPlatform:
-        """Start everything, or adopt what an earlier control plane left running.
+        """Start everything, or adopt the processes that an earlier control plane left running.
+
+        Returns when robots can connect.  After an error nothing that was started runs on.
 
         Raises:
             ConfigurationError: A port is taken, the platform runs already, or a process did not start.
             MissingExtra: Envoy or the backend is not installed.
+            UsageError: The number of servers is below 1.
         """
         began = time.monotonic()
         if self._count < 1:
@@ -242,11 +249,15 @@ class LocalPlatform:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End everything that was started."""
+        """Stop all processes of the platform."""
         await self._end()
 
     def issue_token(self, robot: str, ttl_s: float | None = None) -> str:
-        """Return a token for *robot*, good from now; raises UsageError for a name that is none."""
+        """Return a token for *robot*, valid from now for *ttl_s* seconds (None: ``auth.token_ttl_s``).
+
+        Raises:
+            UsageError: The platform has not started, or *robot* is not a valid name.
+        """
         if self._key is None:
             raise UsageError("the platform has not started", hint="enter it with async with")
         return self._key.issue(
@@ -258,12 +269,12 @@ class LocalPlatform:
         )
 
     async def status(self) -> list[dict[str, Any]]:
-        """Return the /status page of each server; one that does not answer is left out."""
+        """Return the /status page of each backend server; servers that do not answer are left out."""
         pages = await asyncio.gather(*(self.backend_servers.status(server) for server in self.servers))
         return [page for page in pages if page is not None]
 
     def status_document(self) -> dict[str, Any]:
-        """Return the state of the platform as plain JSON values."""
+        """Return the state of the platform as plain JSON values: processes, last sample, policy, events."""
         mark = self.load_balancer.process.mark
         sample = self.sample
         servers = [
@@ -294,7 +305,7 @@ class LocalPlatform:
             "events": [dict(event) for event in self.events[-_LAST_EVENTS:]],
         }
 
-    # --- operations ------------------------------------------------------------------------------
+    # --- operations that change the servers -------------------------------------------------------
 
     async def grow(self, n: int, reason: str) -> list[str]:
         """Launch *n* servers and wait until robots are sent to them; return their names.
@@ -308,7 +319,10 @@ class LocalPlatform:
         return names
 
     async def drain(self, name: str, reason: str = "asked") -> dict[str, Any]:
-        """Let *name* move its robots and leave, and wait until it has; return the ``drain-over`` report.
+        """Have server *name* move its robots and exit, wait for it, and return the report of the drain.
+
+        The report has the keys server, seconds and ``clean``: whether the server drained without being
+        killed.  If a drain of *name* is under way, only its end is waited for, and ``clean`` is True.
 
         Raises:
             UsageError: There is no such server, or it is the last one.
@@ -322,7 +336,7 @@ class LocalPlatform:
         return await self._fleet.finish_drain(member, began)
 
     def check_drain(self, name: str) -> Member:
-        """Return the server *name* that may be drained; raises UsageError as `drain` does."""
+        """Return the server *name*; raises UsageError if there is none, or it is the last one."""
         member = self._fleet.member(name)
         if all(server.name == name for server in self.servers):
             raise UsageError(
@@ -332,11 +346,13 @@ class LocalPlatform:
         return member
 
     async def replace(self, name: str, reason: str) -> str:
-        """Cut *name* off, and wait until robots are sent to a server in its place; return the new name.
+        """Kill server *name*, launch another in its place, and wait until robots are sent to that one.
+
+        Returns the name of the new server.  A server that drains already is not killed.
 
         Raises:
             UsageError: There is no such server.
-            ConfigurationError: The new one did not become healthy.
+            ConfigurationError: The new server did not become healthy.
         """
         self._fleet.member(name)
         new = self._fleet.launch_replacement(name, reason)
@@ -349,7 +365,7 @@ class LocalPlatform:
 
         Raises:
             UsageError: Nothing changes, or a change needs a restart of the platform.
-            ConfigurationError: A platform that is open to its network cannot have them.
+            ConfigurationError: The platform is open to its network, and the settings are not allowed there.
         """
         change = settings_change(self.settings, settings)
         if self.lan is not None:
@@ -357,17 +373,19 @@ class LocalPlatform:
         return change
 
     async def roll(self, change: SettingsChange | None = None) -> None:
-        """Replace every server, one by one: the new one serves before the old one is drained.
+        """Replace every backend server, one by one: the new one serves before the old one is drained.
 
-        The data service and the rosbridge server are replaced last: clients of the one repeat what they
-        asked for meanwhile, clients of the other have to connect again.  A warm standby of before is ended
-        first: it has the old release in its memory.  *change* has the settings of the new servers; None
-        leaves them as they are.
+        The data server and the rosbridge server are replaced last; clients of the data service repeat
+        requests that failed meanwhile, rosbridge clients have to connect again.  A warm standby process is
+        killed first, since it has the old release in its memory.
+
+        Args:
+            change: The settings of the new servers; None leaves the settings as they are.
 
         Raises:
-            ConfigurationError: A new server did not become healthy, and was withdrawn; the roll has stopped,
-                and the old servers that are left serve on.  Servers that start later have the old settings.
-                Or every server was replaced, and the data service or the rosbridge server does not start.
+            ConfigurationError: A new server did not become healthy and was killed; the roll has stopped, the
+                old servers that are left serve on, and servers that start later have the old settings.  Or
+                every backend server was replaced, and the data server or the rosbridge server does not start.
         """
         before = self.settings
         if change is not None:
@@ -385,7 +403,11 @@ class LocalPlatform:
             await self._rosbridge.restart(STOP_TIMEOUT_S)
 
     def _write_settings(self, settings: PlatformSettings) -> None:
-        """Take *settings* for the servers that start from now on; raises ConfigurationError."""
+        """Write *settings* to the file that servers read at their start, and use them from now on.
+
+        Raises:
+            ConfigurationError: The file cannot be written; the settings stay as they were.
+        """
         file = settings_file(self.state)
         try:
             replace_json(file, local_placement(settings, self.state).document(settings), indent=1)
@@ -396,9 +418,10 @@ class LocalPlatform:
         self.settings = settings
 
     async def _replace_servers(self) -> None:
+        """Replace the servers of now one by one, while the scale modifier does not change their number."""
         self._control.hold = True
         try:
-            # A server that is starting may have read the former settings already.
+            # Servers that are still starting are replaced, too: they may have read the former settings.
             servers = [m.name for m in self._fleet.members.values() if not (m.leaving or m.out)]
             await self._wait_until_healthy(servers)
             self.backend_servers.standby.close()
@@ -422,26 +445,26 @@ class LocalPlatform:
             self._control.hold = False
             self._control.watch_spread()
 
-    # --- faults ----------------------------------------------------------------------------------
+    # --- faults that an operator or an experiment injects -----------------------------------------
 
     def kill(self, name: str) -> None:
-        """End *name* with SIGKILL, as a crash would; raises UsageError for a name that is none."""
+        """Send SIGKILL to server *name*, like a crash; raises UsageError if there is none."""
         self._fleet.member(name)
         self.backend_servers.send(name, signal.SIGKILL)
         self._emit("server-killed", server=name)
 
     def pause(self, name: str) -> None:
-        """Stop all processes of *name* with SIGSTOP, as a hang would; raises UsageError."""
+        """Stop the processes of server *name* with SIGSTOP, like a hang; raises UsageError if unknown."""
         self._signal_all(name, signal.SIGSTOP)
         self._emit("server-paused", server=name)
 
     def resume(self, name: str) -> None:
-        """Let a paused server go on; raises UsageError."""
+        """Continue all processes of the paused server *name*; raises UsageError if there is none."""
         self._signal_all(name, signal.SIGCONT)
         self._emit("server-resumed", server=name)
 
     def kill_balancer(self) -> None:
-        """End the balancer with SIGKILL, which cuts every socket; an elastic platform brings it back."""
+        """Send SIGKILL to the load balancer, which cuts every connection; an elastic platform restarts it."""
         mark = self.load_balancer.process.mark
         self._emit("balancer-killed", pid=None if mark is None else mark.pid)
         if mark is not None:
@@ -457,7 +480,7 @@ class LocalPlatform:
         members = [self._fleet.members[name] for name in names if name in self._fleet.members]
         await self._fleet.wait_until_healthy(members, 2 * self.settings.local.start_timeout_s)
 
-    # --- start -----------------------------------------------------------------------------------
+    # --- start of the platform --------------------------------------------------------------------
 
     def _make_folder(self) -> None:
         try:
@@ -474,7 +497,11 @@ class LocalPlatform:
         return "" if self.lan is None else self.lan.address
 
     def _leftovers(self) -> PlatformState | None:
-        """Return the state that an earlier control plane left; None if none of its processes still runs."""
+        """Return the state that an earlier control plane left; None if none of its processes still runs.
+
+        Raises:
+            ConfigurationError: Processes still run, and this platform is not adoptable.
+        """
         state = read_state(self.state)
         if state is None or not any(map(is_alive, state.processes())):
             return None
@@ -486,6 +513,7 @@ class LocalPlatform:
         return state
 
     async def _start(self, previous: PlatformState | None, end: float) -> None:
+        """Start or adopt all processes until *end* (monotonic), then the operator's port and the loops."""
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
         self._write_settings(self.settings)
@@ -514,6 +542,7 @@ class LocalPlatform:
         self._write_state()
 
     async def _begin(self, end: float) -> None:
+        """Launch load balancer, backend servers and data server, and wait until all serve."""
         self.load_balancer.launch()
         members = [self._fleet.launch() for _ in range(self._count)]
         await run_together(
@@ -525,8 +554,12 @@ class LocalPlatform:
     async def _adopt(self, previous: PlatformState, end: float) -> None:
         """Adopt the balancer and the servers of *previous* that still run, and launch what is missing.
 
-        Nothing that runs is killed or restarted, a server keeps its name, and the balancer keeps its port.
-        Returns once one server gets robots.
+        No server or balancer that runs is killed or restarted; servers keep their names, and the balancer
+        keeps its port.  Returns once one server gets robots.
+
+        Raises:
+            ConfigurationError: The balancer does not listen, or no server got robots, until *end*
+                (monotonic).
         """
         balancer_lives = previous.load_balancer is not None and is_alive(previous.load_balancer)
         self.load_balancer.adopt(previous.load_balancer if balancer_lives else None, port=previous.port)
@@ -568,7 +601,7 @@ class LocalPlatform:
             )
 
     async def _settings_digest(self, server: ServerState) -> str | None:
-        """Return the digest of the settings that *server* runs with; None if it does not answer."""
+        """Return the digest of the settings that *server* runs with; None if it does not name one."""
         if not server.port:
             return None
         port = self.backend_servers.control(server.control_port)
@@ -576,12 +609,15 @@ class LocalPlatform:
         return None if reply is None else str(reply.document().get("settings", "")) or None
 
     async def _begin_data(self, previous: ServerState | None) -> None:
-        """Adopt the data server *previous*, else start one if robots get the data service."""
+        """Adopt the data server *previous* if it runs, else start one if robots get the data service."""
         if self._has_data or (previous is not None and is_alive(previous.process)):
             await self._begin_single(self.data_servers, DATA_CLUSTER, previous)
 
     async def _begin_rosbridge(self, previous: PlatformState | None) -> None:
-        """Start the rosbridge server, or adopt the one of *previous* if its balancer still runs."""
+        """Start the rosbridge server, or adopt the one of *previous* if its load balancer still runs.
+
+        One whose balancer has exited is killed first: it connects to a port of that balancer.
+        """
         if not self.load_balancer.loopback_port:
             # The balancer was started without rosbridge, or by an earlier release, and keeps its listeners.
             self._emit("rosbridge-failed", name="rosbridge", error="the platform has to be restarted for it")
@@ -596,7 +632,7 @@ class LocalPlatform:
         await self._begin_single(self._rosbridge, ROSBRIDGE_CLUSTER, earlier)
 
     async def _begin_single(self, server: WatchedServer, cluster: str, previous: ServerState | None) -> None:
-        """Adopt the process *previous* if it runs, else start one, on the old port if that is free."""
+        """Adopt the process *previous* if it runs, else start one, on its old port if that is free."""
         if previous is not None and previous.port and is_alive(previous.process):
             server.adopt(previous.process, previous.port)
             self.load_balancer.set_targets([server.target], cluster)
@@ -606,7 +642,7 @@ class LocalPlatform:
         await server.start(0 if previous is None else previous.port)
 
     async def _open_operator_port(self, token: str, earlier: int) -> None:
-        """Listen on the wanted port, or on that of an earlier control plane, or on a free one."""
+        """Open the operator's port: the wanted one, else the *earlier* one, else any free one."""
         await self._operator_port.open(
             token, ports=[port for port in (self._metrics_port, earlier) if port] + [0]
         )
@@ -614,6 +650,7 @@ class LocalPlatform:
             self._emit("metrics-port-taken", port=self._metrics_port)
 
     def _write_state(self) -> None:
+        """Write the state file and the targets for Prometheus, or have them written once there is space."""
         control_plane = mark_of(os.getpid())
         assert control_plane is not None
         ports = {
@@ -646,6 +683,7 @@ class LocalPlatform:
         self._disks.write(self.state / _TARGETS_FILE, service_discovery(self.name, state.servers))
 
     def _report_single_change(self, event: str, **details: Any) -> None:
+        """Emit an event of the data or rosbridge server; make one that is up the balancer's target."""
         self._emit(event, **details)
         if event == "data-server-up":
             self.load_balancer.set_targets([self.data_servers.target], DATA_CLUSTER)
@@ -653,10 +691,13 @@ class LocalPlatform:
             self.load_balancer.set_targets([self._rosbridge.target], ROSBRIDGE_CLUSTER)
         self._write_state()
 
-    # --- stop ------------------------------------------------------------------------------------
+    # --- stop of the platform, and its events -----------------------------------------------------
 
     async def _end(self) -> None:
-        """Let the servers close their robots' connections first; kill what is left, whatever fails."""
+        """Stop servers, then the load balancer; kill processes that are left, also after an error.
+
+        The servers exit first, so that they close their robots' connections themselves.
+        """
         try:
             self._control.stop()
             await self._fleet.close()
@@ -677,13 +718,13 @@ class LocalPlatform:
             with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
                 remove_state(self.state)
                 (self.state / _TARGETS_FILE).unlink(missing_ok=True)
-                if not self._adoptable:  # no one can adopt this platform: its tokens are worthless
+                if not self._adoptable:  # no later platform uses these keys, so its tokens are worthless
                     key_file(self.state).unlink(missing_ok=True)
                     control_token_file(self.state).unlink(missing_ok=True)
             self._recorder.close()
             self._audit.close()
             self._lock.release()
-        await asyncio.sleep(0)  # the end of the audit log may have had something to report
+        await asyncio.sleep(0)  # lets a problem that the audit log reported while it closed become an event
         self._emit("platform-gone")
 
     def _report_unwritten_state(self, problem: str) -> None:
@@ -694,6 +735,7 @@ class LocalPlatform:
         self._loop.call_soon_threadsafe(self._report_unwritten_state, problem)
 
     def _emit(self, event: str, **details: Any) -> None:
+        """Pass an event to the list, the audit log, the recorder, the operator's port and the callback."""
         entry = {"event": event, **details}
         self.events.append(entry)
         self._audit.record(entry)
@@ -706,7 +748,7 @@ class LocalPlatform:
 def _with_sample_observer(
     options: ControlOptions, observe: Callable[[Mapping[str, Any]], None]
 ) -> ControlOptions:
-    """Return *options* with which *observe* gets each sample of the monitor, too."""
+    """Return *options* whose ``on_sample`` calls *observe* with each sample, then the callback of before."""
     before = options.on_sample
 
     def observe_both(sample: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What a local platform needs of the recorder of its events; without a recorder, nothing is kept."""
+"""The interface by which a local platform passes its events and samples to a recorder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class PlatformRecorder(Protocol):
     """Record the events of a platform and the samples of its monitor; no method raises."""
 
     def begin(self) -> None:
-        """Begin to record, before the first server starts; this control plane holds the platform's lock."""
+        """Begin to record; called before the first server starts, with the platform's lock held."""
 
     def record_event(self, event: Mapping[str, Any]) -> None:
         """Record one event of the platform."""
@@ -21,11 +21,11 @@ class PlatformRecorder(Protocol):
         """Record one sample of the monitor."""
 
     def close(self) -> None:
-        """Finish the recording; all servers have exited."""
+        """Finish the recording; called after all servers have exited."""
 
 
 class NullPlatformRecorder:
-    """Record nothing."""
+    """A recorder that records nothing, for a platform without recordings."""
 
     def begin(self) -> None:
         """Do nothing."""

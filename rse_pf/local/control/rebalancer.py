@@ -1,7 +1,8 @@
-"""Decide when robots of crowded servers move: within half a minute after servers or robots came back.
+"""Decide when robots of crowded servers move to others: within 30 s after a server or the balancer came back.
 
-`rse_pf.scaling.rebalance.moves` says how many.  No robot moves while the numbers still change,
-and a request is not repeated before its robots are counted on their new server.
+`rse_pf.scaling.rebalance.moves` computes how many robots each server moves.  No robot moves while the numbers
+of robots still change, and a server gets no further request before the robots that moved are counted on their
+new server.
 """
 
 from __future__ import annotations
@@ -15,17 +16,19 @@ from rse_pf.scaling.rebalance import moves
 
 __all__ = ["MoveRequest", "Rebalancer"]
 
-# Time for which the spread is watched after a change, in seconds.
+# Time after a change for which uneven numbers of robots lead to moves, in seconds.
 _WATCH_S = 30.0
-# Time after a request until its robots are counted on their new server, in seconds.
+# Time after the last robot was asked to move until it is counted on its new server, in seconds; no request
+# before.
 _SETTLE_S = 1.5
-# No robot moves while more than this share of all robots changes from one sample to the next.
+# No robot moves while the servers' numbers of robots change by more than this share of all robots from one
+# sample to the next.
 _STEADY_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MoveRequest:
-    """Ask *server* to let *robots* of its robots move, spread over *spread_s*."""
+    """A request to *server*: ask *robots* of its robots to move, spread over *spread_s* seconds."""
 
     server: str
     robots: int
@@ -33,7 +36,7 @@ class MoveRequest:
 
 
 class Rebalancer:
-    """Keeps the time until which the spread of the robots is watched."""
+    """Decides which servers move robots; keeps the time until which robots may move, and the last sample."""
 
     def __init__(self) -> None:
         self._until_s = -math.inf
@@ -41,13 +44,18 @@ class Rebalancer:
         self._before: Mapping[str, int] = {}
 
     def watch(self, now_s: float) -> None:
-        """Watch the spread from now on, for half a minute."""
+        """Allow moves for 30 s from *now_s* (monotonic)."""
         self._until_s = now_s + _WATCH_S
 
     def requests(self, robots: Mapping[str, int], now_s: float) -> tuple[MoveRequest, ...]:
-        """Return the requests to make now; *robots* has the robots of each healthy server, by name."""
+        """Return the requests to send now; none outside of the time that `watch` began.
+
+        Args:
+            robots: Number of robots of each healthy server, by name, in the newest sample.
+            now_s: Time of that sample, monotonic.
+        """
         before, self._before = self._before, dict(robots)
-        if not self._quiet_until_s <= now_s <= self._until_s or not _steady(before, robots):
+        if not self._quiet_until_s <= now_s <= self._until_s or not _is_steady(before, robots):
             return ()
         move_requests = tuple(
             MoveRequest(server=name, robots=count, spread_s=round(count / MOVES_PER_S, 3))
@@ -59,7 +67,10 @@ class Rebalancer:
         return move_requests
 
 
-def _steady(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
-    """Return whether the same servers carry about the same robots as a sample ago."""
+def _is_steady(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
+    """Return whether *now* has the same servers as *before*, the sample before, and about the same numbers.
+
+    A change by 2 robots in total is always allowed.
+    """
     changed = sum(abs(count - before.get(name, 0)) for name, count in now.items())
     return before.keys() == now.keys() and changed <= max(2.0, _STEADY_SHARE * sum(now.values()))

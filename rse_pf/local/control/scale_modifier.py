@@ -1,10 +1,10 @@
-"""The scale modifier box on one machine: carry out what the policy decides.
+"""The scale modifier box on one machine: carry out what the scaling policy decides.
 
-The policy names the servers to replace; three rules here decide when:
-1. A server whose process ended is replaced at once.
-2. Replacements of servers that ended soon after their start are limited in number per minute (a crash loop).
-3. Servers that run but fail their checks are never replaced all at once: then the fault is more likely in the
-   monitor or the machine.
+The policy says that servers must be replaced; three rules here decide when: 1.  A server whose process has
+exited is replaced at once.  2.  Replacements of servers that exited soon after their start are limited in
+number per minute (a crash loop).  3.  Servers that run but fail their checks are never replaced all at once:
+if all fail, the fault is more likely
+   in the monitor or the machine.
 
 Time is an argument, and the effects are those of the `Fleet`.
 """
@@ -27,36 +27,37 @@ _MINUTE_S = 60.0
 
 
 def bounds_for(scaling: ScalingSettings, count: int) -> ScalingSettings:
-    """Return *scaling* with bounds that allow *count* servers."""
+    """Return *scaling* with ``min_servers`` lowered, or ``max_servers`` raised, to *count* if needed."""
     return dataclasses.replace(
         scaling, min_servers=min(scaling.min_servers, count), max_servers=max(scaling.max_servers, count)
     )
 
 
 def may_start_s(starts: Sequence[float], *, now_s: float, per_minute: int) -> float:
-    """Return when a server that ended soon after its start may be replaced; *now_s* means at once.
+    """Return when a server that exited soon after its start may be replaced; *now_s* means at once.
 
     Args:
-        starts: When replacements were started, in order.
-        now_s: The same clock.
-        per_minute: Most starts in any 60 s.
+        starts: Times at which replacements were started, oldest first, in seconds.
+        now_s: The present time on the same clock.
+        per_minute: Most replacements in any 60 s.
     """
     within = [start for start in starts if now_s - start < _MINUTE_S]
     return now_s if len(within) < per_minute else within[-per_minute] + _MINUTE_S
 
 
 def replace_now(broken: Sequence[str], *, healthy: int, replacing: int) -> tuple[str, ...]:
-    """Return which of the running *broken* servers are replaced now; the others may recover meanwhile.
+    """Return which of the *broken* servers, which run but fail their checks, are replaced now.
 
-    At a time at most half as many are replaced as there are healthy ones, and at least one.
+    With the *replacing* ones, whose replacements are still starting, they are at most half as many as the
+    *healthy* servers, but one is always allowed.  The others wait, and may recover meanwhile.
     """
     return tuple(broken[: max(max(1, healthy // 2) - replacing, 0)])
 
 
 class LocalScaleModifier:
-    """Applies the policy to the servers of a `Fleet`.
+    """Applies the scaling policy to the servers of a `Fleet`.
 
-    It keeps the times of its actions and replacements, and since when each rule holds.
+    It keeps the times of its actions and replacements, and since when each rule of the policy holds.
     """
 
     def __init__(
@@ -69,7 +70,16 @@ class LocalScaleModifier:
         minimum: Callable[[], int] | None = None,
         emit: Callable[..., None],
     ) -> None:
-        """Make a modifier of *servers*; *minimum* is the scheduled ``min_servers``, if any."""
+        """Describe a scale modifier of *servers*.
+
+        Args:
+            servers: The fleet that is changed.
+            settings: Bounds and rules of the scaling policy.
+            max_restarts_per_minute: Limit of rule 2 of this module.
+            compress: Factor by which the policy's times are shortened, for experiments.
+            minimum: Returns the scheduled ``min_servers`` of now; None uses that of *settings*.
+            emit: Called with the name of an event and its details as keywords.
+        """
         self._servers = servers
         self._settings = settings
         self._minimum = minimum
@@ -85,14 +95,16 @@ class LocalScaleModifier:
     def act(
         self, samples: Sequence[Sample], *, now_s: float, period_over: bool, hold: bool = False
     ) -> tuple[Action, ...]:
-        """Decide, carry the actions out, and return them.
+        """Decide, carry the actions out, and return what the policy decided.
+
+        If any action needs a new server and the disk is full, nothing is done, and the result is empty.
 
         Args:
-            samples: Of whole periods.
-            now_s: The clock of the samples.
-            period_over: Whether the newest period is complete; between periods nothing is grown or shrunk,
-                unless servers are missing.
-            hold: Only replace servers, because an operator is changing their number.
+            samples: One sample for each of the last whole periods, oldest first.
+            now_s: The present time on the clock of the samples.
+            period_over: Whether a period has just ended; in between, the number of servers changes only if
+                servers are missing.
+            hold: Only replace servers, because an operation of the operator changes their number.
         """
         self._starts = [start for start in self._starts if now_s - start < _MINUTE_S]
         self._in_crash_loop = self._in_crash_loop and bool(self._starts)
@@ -120,7 +132,7 @@ class LocalScaleModifier:
         if period_over:
             self._acted_s = now_s
         if any(action.kind != "shrink" for action in actions) and self._servers.is_full():
-            return ()  # a new server could not start, and a broken one may recover
+            return ()  # a new server could not start, and an unhealthy one may recover meanwhile
         for action in actions:
             if action.kind == "replace":
                 self._replace(standing, now_s)
@@ -129,7 +141,7 @@ class LocalScaleModifier:
         return actions
 
     def document(self) -> dict[str, Any]:
-        """Return the state of the policy as plain JSON values."""
+        """Return bounds, crash loop and last action of the policy as plain JSON values."""
         last = None
         if self._last is not None:
             last = {"kind": self._last.kind, "servers": self._last.servers, "reason": self._last.reason}
@@ -153,6 +165,7 @@ class LocalScaleModifier:
                 self._last = action
 
     def _replace(self, standing: ServerHealth, now_s: float) -> None:
+        """Replace the servers that have exited or are unhealthy, as far as the rules of this module allow."""
         for name, ended_early in standing.dead.items():
             at_s = may_start_s(self._starts, now_s=now_s, per_minute=self._restarts_per_minute)
             if ended_early and at_s > now_s:
@@ -169,7 +182,7 @@ class LocalScaleModifier:
         self._last = Action(kind="replace", servers=1, names=(name,), reason=reason)
 
     def _report_crash_loop(self, name: str, wait_s: float) -> None:
-        """Emit one event for each crash loop."""
+        """Emit ``crash-loop`` if this is the first server that has to wait in this crash loop."""
         if not self._in_crash_loop:
             self._emit("crash-loop", server=name, wait_s=round(wait_s, 3), reason="servers end too soon")
         self._in_crash_loop = True

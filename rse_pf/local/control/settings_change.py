@@ -1,7 +1,8 @@
-"""Which settings of a running platform a roll can change; pure.
+"""Decide which settings of a running platform a roll can change.
 
-New backend servers and the new data service of a roll read the settings anew.  The control plane and the load
-balancer keep those that they were started with.
+A roll replaces backend servers, data server and rosbridge server, which read the settings at their start.
+The control plane and the load balancer keep the settings that they were started with.  All functions are
+pure.
 """
 
 from __future__ import annotations
@@ -17,31 +18,31 @@ _UNUSED = (
     "batch.", "cloud.", "serving.port", "serving.control_port", "serving.control_host", "data.port",
     "data.host",
 )  # fmt: skip
-"""Groups and settings that no process of a local platform reads: it chooses addresses itself."""
+"""Groups and settings whose changes are ignored: no process of a local platform reads them."""
 _OF_OPTIONS = frozenset(
     (
         "local.servers", "local.port", "local.metrics_port", "recording.folder", "services.folder",
         "services.accept_weak_isolation", "serving.rosbridge", "burst.url",
     )
 )  # fmt: skip
-"""Options of the start may have set these: they keep their values unless the file sets another one."""
+"""Settings that options of rse-pf local may have set: they stay if the file of the roll has the default."""
 _KEPT_UNTIL_RESTART = (
     "local.", "scaling.", "health.", "recording.", "data.store", "serving.host", "serving.rosbridge",
     "session.hello_timeout_s", "session.ping_interval_s", "session.ping_timeout_s",
 )  # fmt: skip
-"""Groups and settings that the control plane or the load balancer reads at its start."""
+"""Groups and settings that need a restart of the platform: control plane or load balancer reads them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingsChange:
-    """The settings after a roll, and each change in words."""
+    """The settings after a roll, and one line of text for each change and each setting that stays."""
 
     settings: PlatformSettings
     words: tuple[str, ...]
 
 
 def settings_change(running: PlatformSettings, wanted: PlatformSettings) -> SettingsChange:
-    """Return what a roll changes with a file that has *wanted*.
+    """Return what a roll changes in a platform with the settings *running*, by a file with those *wanted*.
 
     Raises:
         UsageError: Nothing changes, or a change needs a restart of the platform.
@@ -76,4 +77,5 @@ def settings_change(running: PlatformSettings, wanted: PlatformSettings) -> Sett
 
 
 def _values(settings: PlatformSettings) -> dict[str, object]:
+    """Return the value of each setting, by ``group.name``."""
     return {f"{row.group}.{row.name}": row.value for row in setting_rows(settings)}

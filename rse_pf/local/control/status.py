@@ -1,7 +1,7 @@
-"""The state of a platform: the table of ``rse-pf local status``.
+"""Read the state of a platform from its processes, and format it as the table of ``rse-pf local status``.
 
-The table works without the control plane: the state file names the processes, and each server answers on its
-control port.  Nothing is changed, and a server that is stopped or cut off delays the answer by the timeout at
+This works without the control plane: the state file names the processes, and each server answers on its
+control port.  Nothing is changed, and a server that does not answer delays the result by two time limits at
 most.
 """
 
@@ -29,15 +29,18 @@ from rse_pf.terminal import printable
 
 __all__ = ["data_url", "platform_status", "status_table"]
 
-# Time limit of a request to a server, in seconds.
+# Time limit of one request to a server, in seconds.
 _TIMEOUT_S = 0.5
-# Tenants with the most CPU time that the table names; --json has all.
+# The table names this many tenants, those with the most CPU time; --json has all.
 _MAX_TENANTS = 5
 _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 
 async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str, Any]:
-    """Return what runs; CPU (% of the server's size) and requests are those of *sample_s* seconds.
+    """Return the state of all processes of the platform in *state*, as plain JSON values.
+
+    The status of each backend server is read twice, *sample_s* seconds apart; CPU load (in % of what the
+    server may use) and requests/s are the means between the two.
 
     Raises:
         UsageError: The control ports require a token, and its file cannot be read.
@@ -71,7 +74,7 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
 
 
 def status_table(status: Mapping[str, Any]) -> str:
-    """Return *status* as lines for a terminal."""
+    """Return the result of `platform_status` as the lines of a table, separated by newlines."""
     rows = [_COLUMNS, *(_row(server) for server in status["servers"])]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
     lines = [
@@ -90,7 +93,7 @@ def status_table(status: Mapping[str, Any]) -> str:
     for server in status["servers"]:
         for tenant, taken_s in server.get("tenant_cpu_s", {}).items():
             taken[tenant] += taken_s
-    if len(taken) > 1:  # one tenant has what the servers have
+    if len(taken) > 1:  # the time of a single tenant says nothing that the servers' rows do not
         most = sorted(taken, key=taken.__getitem__, reverse=True)[:_MAX_TENANTS]
         shown = ", ".join(f"{tenant} {taken[tenant]:.1f} s" for tenant in most)
         lines.append(f"computed for tenants  {shown}")
@@ -108,14 +111,19 @@ def data_url(url: str) -> str:
 
 
 def _disks(folder: Path) -> list[DiskSpace]:
+    """Return the file systems that the platform in *folder* writes to.
+
+    If its settings are of another version, those of the default settings.
+    """
     try:
         settings = platform_settings(folder) or PlatformSettings()
-    except ConfigurationError:  # of another version
+    except ConfigurationError:  # settings of another version
         settings = PlatformSettings()
     return disk_spaces(folders_of(folder, local_placement(settings, folder).store))
 
 
 async def _single_server(server: ServerState, ready: str) -> dict[str, Any]:
+    """Return the state of the data or rosbridge server; it is ready if its path *ready* answers 200."""
     row: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
     silent = _state_without_answer(server.process, server.port)
     if silent is not None:
@@ -127,15 +135,16 @@ async def _single_server(server: ServerState, ready: str) -> dict[str, Any]:
 
 
 async def _server(server: ServerState, token: str | None, sample_s: float) -> dict[str, Any]:
+    """Return the row of one backend server; only name, pid and state if it does not answer."""
     row: dict[str, Any] = {"name": server.name, "pid": server.process.pid}
     silent = _state_without_answer(server.process, server.control_port)
     if silent is not None:
         return {**row, "state": silent}
     port = ControlPort(server.control_port, token)
     try:
-        first, began = await _ask(port), time.monotonic()
+        first, began = await _read_status(port), time.monotonic()
         await asyncio.sleep(sample_s)
-        second, wall_s = await _ask(port), time.monotonic() - began
+        second, wall_s = await _read_status(port), time.monotonic() - began
     except ConnectionError:
         return {**row, "state": "silent"}
     finally:
@@ -155,7 +164,8 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
     }
 
 
-async def _ask(port: ControlPort) -> dict[str, Any]:
+async def _read_status(port: ControlPort) -> dict[str, Any]:
+    """Return the /status page at *port*; raises ConnectionError if there is none."""
     reply = await port.ask("/status", timeout_s=_TIMEOUT_S)
     document = reply.document()
     if reply.status != 200 or "workers" not in document:
@@ -164,7 +174,7 @@ async def _ask(port: ControlPort) -> dict[str, Any]:
 
 
 def _state_without_answer(process: ProcessMark, port: int) -> str | None:
-    """Return the state of a process that cannot answer; None if it can."""
+    """Return why a process cannot answer: ``gone``, ``stopped`` or ``starting``; None if it can."""
     if not is_alive(process):
         return "gone"
     if _is_stopped(process.pid):
@@ -178,6 +188,7 @@ def _row(server: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _is_stopped(pid: int) -> bool:
+    """Return whether a signal or a debugger has stopped process *pid*; False if there is none."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
     except OSError:

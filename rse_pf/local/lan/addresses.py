@@ -1,6 +1,6 @@
-"""The address at which other machines of the network reach this one.
+"""Find the address at which other machines of the network reach this one.
 
-No packet is sent: the routing table gives the source address that a packet would have.
+No packet is sent: the routing table gives the source address that a packet to another network would have.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from rse_pf.errors import ConfigurationError, UsageError
 __all__ = ["check_lan_address", "host_names", "lan_address"]
 
 _REMOTE = (("192.0.2.1", socket.AF_INET), ("2001:db8::1", socket.AF_INET6))
-"""Addresses that are reserved for documentation (RFC 5737, RFC 3849)."""
+"""Destinations whose routes are looked up: addresses reserved for documentation (RFC 5737, RFC 3849)."""
+# Port of the destinations; any number, since no packet is sent.
 _PORT = 9
 _EXAMPLE = "for example: --lan 192.168.1.20; ip address shows the addresses of this machine"
 
 
 def lan_address() -> str:
-    """Return the address that this machine has in its network.
+    """Return the address that this machine has in its network, IPv4 if there is one.
 
     Raises:
         ConfigurationError: No route leads out of this machine.
@@ -37,10 +38,12 @@ def lan_address() -> str:
 
 
 def check_lan_address(text: str) -> str:
-    """Return *text*, an address that other machines could reach, in its usual form.
+    """Return the IP address *text* in its normal form, if other machines could connect to it.
+
+    Whether this machine has the address is not checked.
 
     Raises:
-        UsageError: It is no address, or a loopback or unspecified one.
+        UsageError: *text* is no IP address, or a loopback, unspecified or multicast one.
     """
     try:
         address = ipaddress.ip_address(text)
@@ -52,7 +55,11 @@ def check_lan_address(text: str) -> str:
 
 
 def host_names() -> tuple[str, ...]:
-    """Return the names under which machines of the network may know this one (mDNS)."""
+    """Return the host names by which robots and browsers may address this machine.
+
+    They are ``HOST.local`` of multicast DNS, unless the host name has other characters than letters, digits
+    and hyphens, and ``localhost``.
+    """
     label = socket.gethostname().partition(".")[0].lower()
     is_label = label.isascii() and label.replace("-", "").isalnum()
     return (f"{label}.local", "localhost") if is_label and label != "localhost" else ("localhost",)

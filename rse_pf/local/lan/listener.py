@@ -1,8 +1,9 @@
-"""The listener for other machines of the network: its address, and the files of its certificates.
+"""Make and renew the certificates of the listener for other machines of the network.
 
-``authority.pem`` in the platform's folder holds the authority with its key and stays; the certificate of the
-listener is in the file that Envoy watches, and is replaced before it expires, while the platform runs.  Both
-hold a private key and can be read by their owner only.  ``authority.crt`` is the public half, for browsers.
+In the platform's state folder, ``authority.pem`` holds a certificate authority with its private key, which is
+kept over restarts.  ``tls.json``, which Envoy watches, holds the listener's certificate and key, and is
+replaced before the certificate expires.  Both files can be read by the operator's user only.
+``authority.crt`` is the certificate of the authority without its key, for robots and browsers.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from rse_pf.storage.files import OWNER_ONLY, read_private_file, replace_file
 __all__ = ["CERTIFICATE_NAME", "LanListener", "authority_file", "secret_document", "secret_file"]
 
 CERTIFICATE_NAME = "front-door"
-"""Name of the listener's certificate in Envoy's file."""
-# A certificate is renewed when it is valid for less than this, in seconds.
+"""Name under which Envoy's configuration refers to the certificate in ``tls.json``."""
+# A certificate is replaced when it expires within this time, in seconds: a third of a server certificate's
+# validity.
 _RENEW_S = SERVER_S / 3
 # Time between two checks of the certificate, in seconds.
 _CHECK_EVERY_S = 3600.0
@@ -38,17 +40,20 @@ _HINT = "remove the file; robots must be enrolled again"
 
 
 def authority_file(folder: Path) -> Path:
-    """Return the file of the public certificate of the authority of the platform in *folder*."""
+    """Return the path of the certificate, without key, of the authority of the platform in *folder*."""
     return folder / "authority.crt"
 
 
 def secret_file(folder: Path) -> Path:
-    """Return the file from which Envoy reads certificate and key."""
+    """Return the path from which Envoy reads certificate and key of the listener."""
     return folder / "tls.json"
 
 
 def secret_document(server: CertificateWithKey) -> dict[str, Any]:
-    """Return Envoy's file with *server*, certificate and key in one, so that both change in one step."""
+    """Return the content of ``tls.json`` as plain JSON values: certificate and key of *server*.
+
+    Both are in one file, so that they change in one step.
+    """
     kind = "type.googleapis.com/envoy.extensions.transport_sockets.tls.v3.Secret"
     certificate = {
         "certificate_chain": {"inline_string": server.certificate},
@@ -59,26 +64,29 @@ def secret_document(server: CertificateWithKey) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LanListener:
-    """The address of the listener, and the folder of the platform; `prepare` makes the files."""
+    """The address of the listener, and the state folder of the platform; `prepare` makes its files."""
 
     address: str
     folder: Path
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The subjects of the certificate: the address, and the names of this machine."""
+        """The subjects of the certificate: the address, the host names of this machine, and 127.0.0.1."""
         return (self.address, *host_names(), _LOOPBACK)
 
     def prepare(self, platform: str, *, now_s: float) -> bool:
-        """Make what is missing, expires soon or is for another address; return whether anything changed.
+        """Make the authority and the certificate if they are missing or expire soon.
+
+        A certificate for other names, or of another authority, is replaced, too.  Returns whether the
+        certificate is new.
 
         Args:
             platform: Name of the platform, for the authority's certificate.
-            now_s: Unix seconds.
+            now_s: The present time, Unix seconds.
 
         Raises:
-            ConfigurationError: The file of the authority cannot be read, is damaged, or others may read it;
-                a file cannot be written.
+            ConfigurationError: The file of the authority cannot be read, is damaged, or other users may read
+                it; or a file cannot be written.
         """
         try:
             return self._prepare(platform, now_s)
@@ -104,7 +112,7 @@ class LanListener:
         return True
 
     def authority(self) -> CertificateWithKey:
-        """Return the authority; raises UsageError."""
+        """Return the authority with its key; raises UsageError if its file is missing or damaged."""
         path = self.folder / "authority.pem"
         text = read_private_file(path, "the authority", hint=_HINT).decode("utf-8", "replace")
         try:
@@ -115,7 +123,10 @@ class LanListener:
     async def keep_valid(
         self, platform: str, renewed: Callable[[], None], problem: Callable[[str], None]
     ) -> None:
-        """Renew the certificate before it expires, until cancelled; *problem* gets why that failed."""
+        """Renew the certificate before it expires, until cancelled; it is checked once an hour.
+
+        *renewed* is called after each renewal, and *problem* with a sentence after each one that failed.
+        """
         while True:
             await asyncio.sleep(_CHECK_EVERY_S)
             try:
@@ -125,6 +136,7 @@ class LanListener:
                 problem(f"the certificate is not renewed yet: {error.message}")
 
     def _authority(self, platform: str, now_s: float) -> tuple[CertificateWithKey, bool]:
+        """Return the authority, made if it is missing or expires soon, and whether it was made now."""
         path = self.folder / "authority.pem"
         is_new = not path.exists() or self.authority().expires_s - now_s < _RENEW_S
         if is_new:
@@ -135,7 +147,7 @@ class LanListener:
         return authority, is_new
 
     def _read_certificate(self) -> CertificateWithKey | None:
-        """Return the certificate that Envoy has; None if there is none that can be used."""
+        """Return the certificate in ``tls.json``; None if the file is missing or damaged."""
         path = secret_file(self.folder)
         try:
             document = json.loads(read_private_file(path, "the certificate", hint=_HINT))

@@ -1,4 +1,4 @@
-"""Backend and data servers as processes of this machine: start, watch, adopt, replace.
+"""Backend, data and rosbridge servers as processes of this machine: start, watch, adopt, replace.
 
-Processes belong here; decisions about how many there are belong to `control`.
+How a process is started and stopped belongs here; how many backend servers there are is decided in `control`.
 """

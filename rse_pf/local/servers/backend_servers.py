@@ -1,7 +1,7 @@
-"""The backend servers box on one machine: ``rse-pf serve`` processes, the command that EC2 runs too.
+"""Start, stop and kill backend servers on one machine: processes of ``rse-pf serve``, as on EC2.
 
-Starts, ends and kills them; the caller decides how many and when.  Only processes whose id and start time are
-known are signalled.
+The caller decides how many servers there are, and when.  Only processes whose id and start time are known are
+signalled.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rse_pf.local.state import control_token_file, recording_key_file, settings_
 __all__ = ["RSE_PF", "BackendServer", "LocalBackendServers", "local_placement"]
 
 RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
-"""The program; ``serve`` and its options follow."""
+"""The command line of this package, to which a verb and its options are appended."""
 
 _LOOPBACK = "127.0.0.1"
 # Time limit of a request to a server's control port, in seconds.
@@ -37,7 +37,11 @@ _STATUS_TIMEOUT_S = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BackendServer:
-    """A server that has announced itself."""
+    """A backend server that has announced itself.
+
+    ``pid`` and ``mark`` are of its supervisor process, ``workers`` and ``worker_marks`` of its worker
+    processes; a worker that had exited when it was looked up has no mark.  Robots connect to ``port``.
+    """
 
     name: str
     pid: int
@@ -50,12 +54,12 @@ class BackendServer:
 
     @property
     def target(self) -> Target:
-        """This server as the load balancer sees it."""
+        """This server as a target of the load balancer."""
         return Target(name=self.name, port=self.port, control_port=self.control_port)
 
 
 class LocalBackendServers:
-    """The server processes of one platform, by name."""
+    """The backend server processes of one platform, by name, and its warm standby."""
 
     def __init__(
         self,
@@ -77,12 +81,15 @@ class LocalBackendServers:
 
     @property
     def marks(self) -> dict[str, ProcessMark]:
-        """Every process that was launched and not yet ended by us, by server name."""
+        """The mark of each server that was launched or adopted and not forgotten yet, by name."""
         marks = ((name, process.mark) for name, process in self._processes.items())
         return {name: mark for name, mark in marks if mark is not None}
 
     def launch(self, name: str) -> None:
-        """Start the process of server *name*, and return before it listens."""
+        """Start the process of server *name*, and return before it listens.
+
+        The warm standby becomes the server if there is one; else a new process is started.
+        """
         server = self._processes[name] = ServerProcess(name, self._folder)
         server.prepare()
         command = ["serve", "--settings", str(settings_file(self._folder)), "--server-id", name]
@@ -98,15 +105,16 @@ class LocalBackendServers:
             server.start([*self._program, *command], dies_with_parent=self._dies_with_parent)
 
     def adopt(self, name: str, mark: ProcessMark) -> None:
-        """Take over a server that an earlier control plane launched as *name*, ready or not."""
+        """Take over the server *name*, which an earlier control plane launched; it may still be starting."""
         self._processes[name] = ServerProcess(name, self._folder)
         self._processes[name].mark = mark
 
     async def wait_ready(self, name: str, timeout_s: float) -> BackendServer:
-        """Return server *name* once it has announced itself.
+        """Wait until server *name* has announced itself, and return it.
 
         Raises:
-            ConfigurationError: It ended or was not ready in time; its last log line is in the message.
+            ConfigurationError: It exited, or was not ready within *timeout_s*; its last log line is in the
+                message.
         """
         process = self._processes[name]
         announcement = await process.wait_announced(timeout_s)
@@ -120,50 +128,51 @@ class LocalBackendServers:
         )  # fmt: skip
 
     def control(self, port: int) -> ControlPort:
-        """Return a client of the control port *port* of one of these servers, with its token.
+        """Return a client of the control port *port* of one of these servers, with the platform's token.
 
         Raises:
-            UsageError: The file of the token is missing, or holds none.
+            UsageError: The file of the token is missing, or holds no token.
         """
         return ControlPort(port, read_control_token(control_token_file(self._folder)))
 
     async def status(self, server: BackendServer) -> dict[str, Any] | None:
-        """Return the /status page of *server*; None when it does not answer."""
+        """Return the /status page of *server*; None if it does not answer with 200 within 1 s."""
         reply = await self.control(server.control_port).ask_once("/status", timeout_s=_STATUS_TIMEOUT_S)
         return None if reply is None or reply.status != 200 else reply.document()
 
     async def metrics(self, server: BackendServer) -> str | None:
-        """Return the server's page for Prometheus; None when it does not answer."""
+        """Return the metrics page of *server* for Prometheus; None if it does not answer 200 within 1 s."""
         reply = await self.control(server.control_port).ask_once("/metrics", timeout_s=_STATUS_TIMEOUT_S)
         return None if reply is None or reply.status != 200 else reply.body.decode("utf-8", "replace")
 
     async def wait_over(self, name: str) -> int | None:
-        """Wait until the process of *name* has ended; return its exit code, negative for a signal.
+        """Wait until the process of server *name* has exited; return its exit code, negative for a signal.
 
-        None means that it is not known: the server was adopted, and is no child of this process.
+        None if the code is not known, because the server was adopted and is no child of this process, or if
+        there is no such server.
         """
         process = self._processes.get(name)
         return None if process is None else await process.wait_over()
 
     def send(self, name: str, number: signal.Signals) -> bool:
-        """Signal server *name*; return False if it is gone."""
+        """Send signal *number* to server *name*; return False if it has exited, or there is none."""
         process = self._processes.get(name)
         return process is not None and process.send(number)
 
     def forget(self, name: str) -> None:
-        """Drop a server whose process is over, and reap it; kills it first if it is not."""
+        """Remove server *name*, and reap its process; a process that still runs is killed first."""
         process = self._processes.pop(name, None)
         if process is not None:
             process.kill()
 
     async def stop(self, timeout_s: float) -> None:
-        """Let all servers leave at once, and kill what has not left after *timeout_s*."""
+        """Ask all servers with SIGINT to stop, at the same time; kill those that run after *timeout_s*."""
         stops = (process.stop(signal.SIGINT, timeout_s) for process in self._processes.values())
         await asyncio.gather(*stops)
         self.kill_all()
 
     def kill_all(self) -> None:
-        """End what is left, at once, and reap it."""
+        """Kill all servers and the warm standby at once, and reap them."""
         self.standby.close()
         for process in self._processes.values():
             process.send(signal.SIGKILL)
@@ -172,9 +181,10 @@ class LocalBackendServers:
 
 
 def local_placement(settings: PlatformSettings, state: Path) -> ServerPlacement:
-    """Return the placement of every local server: loopback, free ports, the workers of this machine.
+    """Return the placement of every server of a local platform: loopback, free ports, and one object store.
 
-    Servers come and go, so objects are in the folder of the platform if they were to be in memory.
+    A store ``memory:`` becomes the folder ``objects`` in *state*, since several processes use it and each may
+    exit; ``serving.workers`` 0 becomes one worker.
     """
     store = settings.data.store
     return ServerPlacement.of(

@@ -1,7 +1,7 @@
-"""Ask a server's control port over one connection that stays open, so that health checks cost little.
+"""A client of control ports, over one connection that stays open, so that health checks cost little.
 
-Every request has a deadline, and every failure is a ConnectionError.  A late reply is never taken for the
-reply to a later request.
+Every request has a time limit, and every failure is a ConnectionError.  A late reply is never taken for the
+reply to a later request, since a failure closes the connection.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ from rse_pf.errors import UsageError
 __all__ = ["ControlPort", "ControlPortReply"]
 
 _LOOPBACK = "127.0.0.1"
+# Longest head of a reply, in bytes; a longer one is an error.
 _MAX_HEAD_BYTES = 16384
+# Longest body of a reply, or line of a stream of events, in bytes; a longer one is an error.
 _MAX_BODY_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlPortReply:
-    """What a control port answered."""
+    """The reply of a control port: HTTP status and body."""
 
     status: int
     body: bytes
 
     def document(self) -> dict[str, Any]:
-        """Return the body as a JSON object; empty when it is none."""
+        """Return the body as a JSON object; an empty one if the body is no JSON object."""
         try:
             document = json.loads(self.body)
         except ValueError:
@@ -39,9 +41,10 @@ class ControlPortReply:
 
 
 class ControlPort:
-    """One control port on this machine; connects with the first request, and again after a failure.
+    """A client of one control port on this machine.
 
-    Each request carries *token*, if the port requires one.
+    It connects at the first request, and again after a failure.  Each request carries *token*; None if the
+    port requires none.
     """
 
     def __init__(self, port: int, token: str | None = None) -> None:
@@ -54,10 +57,13 @@ class ControlPort:
         self._lock = asyncio.Lock()
 
     async def ask(self, target: str, *, timeout_s: float, method: str = "GET") -> ControlPortReply:
-        """Return the reply to a request for *target*.
+        """Send a request for *target* (path and query), and return the reply, of any HTTP status.
+
+        Concurrent calls wait for each other; *timeout_s* begins after that wait.
 
         Raises:
-            ConnectionError: Nobody listens, the reply is no HTTP, or it took longer than *timeout_s*.
+            ConnectionError: Nobody listens, the reply is no HTTP or too long, or it took more than
+                *timeout_s*.
         """
         async with self._lock:
             try:
@@ -74,7 +80,7 @@ class ControlPort:
     async def ask_once(
         self, target: str, *, timeout_s: float, method: str = "GET"
     ) -> ControlPortReply | None:
-        """Return the reply to one request, None if there is none in time, and close the connection."""
+        """Return the reply to one request, or None where `ask` raises; then close the connection."""
         try:
             return await self.ask(target, timeout_s=timeout_s, method=method)
         except ConnectionError:
@@ -85,11 +91,13 @@ class ControlPort:
     async def follow(
         self, target: str, *, silence_s: float, method: str = "POST"
     ) -> AsyncGenerator[dict[str, Any], None]:
-        """Yield the events of an operation until it is over, over a connection of its own.
+        """Request an operation, and yield its events until the port closes the connection.
+
+        Uses a connection of its own.
 
         Raises:
-            UsageError: The port refuses.
-            ConnectionError: Nobody listens, the reply is no HTTP, or nothing came for *silence_s*.
+            UsageError: The port refuses the operation, with its message and hint.
+            ConnectionError: Nobody listens, the reply is no HTTP, or no event came for *silence_s* seconds.
         """
         writer: asyncio.StreamWriter | None = None
         try:
@@ -114,7 +122,7 @@ class ControlPort:
                 writer.close()
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection, if there is one; the next request connects again."""
         if self._writer is not None:
             self._writer.transport.abort()
         self._reader = self._writer = None

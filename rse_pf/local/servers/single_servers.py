@@ -1,4 +1,4 @@
-"""The servers that run once on one machine: the data servers box of Fig. 2, and the rosbridge server."""
+"""Describe the data server (a box of Fig. 2) and the rosbridge server; a local platform has one of each."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ def local_data_server(
     program: Sequence[str] = RSE_PF,
     **options: Any,
 ) -> WatchedServer:
-    """Return the data server of the platform in *folder*.
+    """Return the data server of the platform in *folder*; it is not started.
 
     Args:
-        settings: Groups health and local.
-        folder: Holds settings and public keys.
-        store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
-        program: What to run; ``data`` and its options follow.
-        options: Of `WatchedServer`.
+        settings: Settings, of which the groups health and local are read here.
+        folder: State folder, with the files of settings and public keys that the server reads.
+        store: Object store in place of ``data.store``, such as a folder instead of ``memory:``; None keeps
+            it.
+        program: The command to which ``data`` and its options are appended.
+        options: Further arguments of `WatchedServer`.
     """
     command = [
         *program, "data", "--settings", str(settings_file(folder)), "--keys", str(key_set_file(folder)),
@@ -51,14 +52,14 @@ def local_data_server(
 def local_rosbridge_server(
     settings: PlatformSettings, *, folder: Path, url: str, program: Sequence[str] = RSE_PF, **options: Any
 ) -> WatchedServer:
-    """Return the rosbridge server of the platform in *folder*, whose robots connect to *url*.
+    """Return the rosbridge server of the platform in *folder*; it is not started.
 
     Args:
-        settings: Groups health and local.
-        folder: Holds settings.
-        url: Of the load balancer, on loopback.
-        program: What to run; ``rosbridge`` and its options follow.
-        options: Of `WatchedServer`.
+        settings: Settings, of which the groups health and local are read here.
+        folder: State folder, with the file of settings that the server reads.
+        url: Address of the load balancer on loopback, to which the server connects for its clients.
+        program: The command to which ``rosbridge`` and its options are appended.
+        options: Further arguments of `WatchedServer`.
     """
     command = [
         *program, "rosbridge", "--settings", str(settings_file(folder)), "--url", url, "--host", _LOOPBACK,

@@ -1,7 +1,8 @@
-"""Keep one server process warm: its imports take most of the time that a server needs to start.
+"""Keep one process that has imported everything a backend server needs, for the next launch.
 
-A replacement starts while the other servers do the work of the one that ended.  The standby ends with the
-platform.  Without a standby a launch takes longer.
+The imports take most of the time that a server needs to start, and when a server has failed, the others do
+its work until its replacement serves.  Without a standby a launch only takes longer.  The standby is killed
+when the platform stops.
 
 Source:
     Warm pools of AWS Auto Scaling.
@@ -25,11 +26,11 @@ __all__ = ["STANDBY", "WarmStandby"]
 # Time between two checks whether the standby is warm, in seconds.
 _POLL_S = 0.01
 STANDBY = (sys.executable, "-m", "rse_pf.cli.servers.standby")
-"""The program; it reads its arguments from standard input."""
+"""The command of a standby process; it reads the arguments of the server from standard input."""
 
 
 class WarmStandby:
-    """At most one process that has imported what a server needs; none if *program* is empty."""
+    """At most one standby process; none is ever started if *program* is empty."""
 
     def __init__(self, folder: Path, *, dies_with_parent: bool, program: Sequence[str] = STANDBY) -> None:
         self._folder = folder
@@ -45,7 +46,7 @@ class WarmStandby:
 
     @property
     def is_warm(self) -> bool:
-        """Whether the standby has imported everything."""
+        """Whether there is a standby that has imported everything: it has then written a line to its log."""
         return self.pid is not None and log_size(self._log) > self._log_from
 
     @property
@@ -53,7 +54,7 @@ class WarmStandby:
         return self._folder / "standby.log"
 
     def warm(self) -> bool:
-        """Start a standby unless there is one; return whether one was started."""
+        """Start a standby unless there is one; return whether one was started.  Does not wait for it."""
         if self.pid is not None or not self._program:
             return False
         self.close()
@@ -72,7 +73,10 @@ class WarmStandby:
             await asyncio.sleep(_POLL_S)
 
     def take(self, arguments: Sequence[str], log: Path) -> subprocess.Popen[bytes] | None:
-        """Turn the standby into the program of *arguments*, which writes to *log*; None if there is none."""
+        """Make the standby a server: it runs rse-pf with *arguments*, and writes to *log* from now on.
+
+        Returns its process, which is no standby any more; None if there is no standby.
+        """
         process = self._process if self.pid is not None else None
         if process is None or process.stdin is None:
             return None
@@ -80,14 +84,14 @@ class WarmStandby:
         try:
             process.stdin.write(order.encode() + b"\n")
             process.stdin.close()
-        except OSError:  # it has just ended
+        except OSError:  # the standby has just exited
             self.close()
             return None
         self._process = None
         return process
 
     def close(self) -> None:
-        """End the standby, if there is one, and reap it."""
+        """Kill the standby, if there is one, and reap it."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()

@@ -1,7 +1,7 @@
-"""A server of one process on one machine: started, watched and replaced; of data, or of rosbridge clients.
+"""Start, watch and replace a server of one process on one machine: the data or the rosbridge server.
 
 A replacement takes the port of the process before it, so the load balancer's configuration does not change.
-A process that answers no health check any more is killed and replaced like one that has ended.
+A process that fails its health checks is killed, and replaced like one that has exited.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rse_pf.processes.linux import run_as_batch
 
 __all__ = ["CHECK_S", "NICENESS", "WatchedServer"]
 
-# Time between two checks of the service, and time limit of one, in seconds.
+# Time between two health checks of the server, and time limit of a check, in seconds.
 CHECK_S = 1.0
 # First pause between two failed starts, in seconds; each next one is twice as long.
 _FIRST_PAUSE_S = 0.1
@@ -29,14 +29,15 @@ _FIRST_PAUSE_S = 0.1
 _MAX_PAUSE_S = 5.0
 # Time between two checks whether a full disk has space again, in seconds.
 _WAIT_FOR_SPACE_S = 0.5
-# Niceness of these servers: on one machine poses have priority.
+# Niceness of these servers: backend servers, which compute poses, get the CPU time of a busy machine first.
 NICENESS = 10
 
 
 class WatchedServer:
-    """One process with a name, and its replacements.
+    """One server process, and its replacements, which have the same name.
 
-    ``port`` is that of the process and of its replacements, 0 before the first start.
+    ``port`` is the port of the process; 0 before the first start.  A replacement takes the same port, or a
+    free one if another program has it.
     """
 
     def __init__(
@@ -55,22 +56,24 @@ class WatchedServer:
         is_full: Callable[[], bool] = lambda: False,
         emit: Callable[..., None] = lambda event, **details: None,
     ) -> None:
-        """Remember what to start.
+        """Describe the server; nothing is started.
 
         Args:
-            name: Of the process, in log and events.
-            folder: Gets the log and the announcement.
-            command: What to run; ``--announce`` and ``--port`` with their values follow.
+            name: Name of the process in its log and in events.
+            folder: Folder of the log and the announcement.
+            command: The command to which ``--announce``, ``--port`` and their values are appended.
             ready: Path that answers 200 while requests can be served.
             alive: Path that answers 200 unless the process must be replaced.
-            event: Prefix of the names of events.
-            unhealthy_checks: After more failed checks than these, the process is killed.
-            start_timeout_s: How long a start may take.
-            dies_with_parent: Whether the process ends when this one does.
-            replaces: Whether one that ends or hangs is replaced; else only the event is emitted.
-            is_full: Whether the disk is full now; no process is started then.
-            emit: Gets EVENT-start with name and pid, EVENT-up with port, too, EVENT-down with name and code,
-                EVENT-silent and EVENT-failed.
+            event: Prefix of the names of events, EVENT below.
+            unhealthy_checks: The process is killed when more checks of *alive* than these fail in a row.
+            start_timeout_s: Longest time from the start of a process to its announcement, in seconds.
+            dies_with_parent: Whether Linux kills the process when this one exits.
+            replaces: Whether a process that exits or fails its checks is replaced; else EVENT-down is emitted
+                when it exits, and nothing more.
+            is_full: Returns whether the disk is full; then a replacement waits.
+            emit: Called with an event and its details: EVENT-start with name and pid, EVENT-up also with
+                port, EVENT-down with name and code, EVENT-silent with name and pid, EVENT-failed with name
+                and error.
         """
         self._ready, self._alive, self._event = ready, alive, event
         self._unhealthy_checks = unhealthy_checks
@@ -86,17 +89,17 @@ class WatchedServer:
 
     @property
     def target(self) -> Target:
-        """The service as the load balancer sees it."""
+        """This server as a target of the load balancer."""
         return Target(name=self.process.name, port=self.port, control_port=self.port)
 
     @property
     def state(self) -> ServerState | None:
-        """The entry of the state file; None if there is no process."""
+        """This server as an entry of the state file; None if there is no process."""
         name, mark = self.process.name, self.process.mark
         return None if mark is None else ServerState(name=name, process=mark, port=self.port)
 
     def document(self) -> list[dict[str, Any]]:
-        """Return name, pid, port and whether it runs, as plain JSON values; empty before the first start."""
+        """Return a list with name, pid, port and ``running`` of the process; empty before the first start."""
         name, mark = self.process.name, self.process.mark
         running = self.process.is_running()
         return (
@@ -104,10 +107,12 @@ class WatchedServer:
         )
 
     async def start(self, port: int = 0) -> None:
-        """Start the process at *port* (0: a free one), wait until it answers, and watch it from then on.
+        """Start the process at *port* (0: a free one), wait for its announcement, and watch it from then on.
+
+        If it does not start at *port*, it is started once more at a free one.
 
         Raises:
-            ConfigurationError: It ended or was not ready in time.
+            ConfigurationError: The process exited, or was not ready in time.
         """
         self.port = port
         try:
@@ -115,15 +120,18 @@ class WatchedServer:
         except ConfigurationError:
             if not port:
                 raise
-            self.port = 0  # another program has it now
+            self.port = 0  # perhaps another program has taken the port
             await self._launch()
         self._watching = asyncio.create_task(self._watch())
 
     async def restart(self, timeout_s: float) -> None:
-        """Replace the process, if there is one, by one that reads the settings anew, at the same port.
+        """Replace the process by one that reads the settings anew, at the same port.
+
+        Does nothing if no process is watched.  The old process is killed if it runs *timeout_s* after
+        SIGTERM.
 
         Raises:
-            ConfigurationError: It did not start; that is tried again from now on.
+            ConfigurationError: The new process did not start; the start is tried again from now on.
         """
         if self._watching is None:
             return
@@ -135,12 +143,12 @@ class WatchedServer:
             self._watching = asyncio.create_task(self._watch())
 
     def adopt(self, mark: ProcessMark, port: int) -> None:
-        """Watch the process of an earlier control plane, and replace it when it ends."""
+        """Watch the process *mark*, which an earlier control plane started at *port*, from now on."""
         self.process.mark, self.port = mark, port
         self._watching = asyncio.create_task(self._watch())
 
     async def is_ready(self) -> bool:
-        """Return whether the service answers and its store does."""
+        """Return whether the server answers its path *ready* with 200."""
         return self.port > 0 and await self._is_answering(self._ready)
 
     async def forget(self) -> None:
@@ -151,17 +159,18 @@ class WatchedServer:
         self._watching = None
 
     async def stop(self, timeout_s: float) -> None:
-        """Let the service leave, and kill it after *timeout_s*."""
+        """Stop watching, send the process SIGTERM, and kill it if it runs after *timeout_s*."""
         await self.forget()
         await self.process.stop(signal.SIGTERM, timeout_s)
         self.kill_all()
 
     def kill_all(self) -> None:
-        """End what is left, at once, and reap it."""
+        """Kill the process, if it runs, and reap it."""
         self.process.kill()
         self.process.mark = None
 
     async def _watch(self) -> None:
+        """Wait until the process has exited and replace it, again and again; without *replaces*, only wait."""
         pause_s = _FIRST_PAUSE_S
         while True:
             code = await self._wait_over()
@@ -181,7 +190,10 @@ class WatchedServer:
                 self.port = 0  # another program may hold the old port
 
     async def _wait_over(self) -> int | None:
-        """Wait for the end of the process and return its exit code; kill it when it fails too many checks."""
+        """Wait until the process has exited, and return its exit code; None if it was adopted.
+
+        If the process is to be replaced, it is killed once it fails too many checks in a row.
+        """
         over = asyncio.ensure_future(self.process.wait_over())
         failed = 0
         try:
@@ -200,6 +212,7 @@ class WatchedServer:
         return reply is not None and reply.status == 200
 
     async def _launch(self) -> None:
+        """Start a process at ``port``, wait for its announcement, and set ``port``; kill it if that fails."""
         command = [*self._command, "--port", str(self.port)]
         self.process.start(command, dies_with_parent=self._dies_with_parent)
         pid = self.process.pid
