@@ -170,7 +170,7 @@ class WatchedServer:
         self.process.mark = None
 
     async def _watch(self) -> None:
-        """Wait until the process has exited and replace it, again and again; without *replaces*, only wait."""
+        """Replace the process each time it has exited; without *replaces*, only report its first exit."""
         pause_s = _FIRST_PAUSE_S
         while True:
             code = await self._wait_over()
