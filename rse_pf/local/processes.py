@@ -303,7 +303,7 @@ class ServerProcess:
         """Return an error whose message is the server's name, *problem*, and the last line that it logged."""
         last = self.last_line()
         return ConfigurationError(
-            f"{self.name} {problem}{': ' if last else ''}{last}", hint=f"its log is {self.log}"
+            f"{self.name} {problem}{': ' if last else ''}{last}", hint=f"read its log {self.log}"
         )
 
 

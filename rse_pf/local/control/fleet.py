@@ -254,7 +254,7 @@ class Fleet:
                 return
             if time.monotonic() >= end:
                 raise ConfigurationError(
-                    f"the load balancer found {member.name} unhealthy", hint=f"its log is {server.log}"
+                    f"the load balancer found {member.name} unhealthy", hint=f"read its log {server.log}"
                 )
             await asyncio.sleep(_PAUSE_S)  # the balancer itself may be restarting
 
@@ -288,7 +288,7 @@ class Fleet:
                     waiting.cancel()
             if not member.healthy.is_set():
                 raise ConfigurationError(
-                    f"{member.name} did not become healthy", hint=f"look at the log {member.name}.log"
+                    f"{member.name} did not become healthy", hint=f"read its log {member.name}.log"
                 )
 
     # --- launches, drains and replacements that the scale modifier and operations decide ----------

@@ -83,7 +83,10 @@ class Operations:
             UsageError: `_MAX_WATCHERS` connections watch already.
         """
         if self._watchers >= _MAX_WATCHERS:
-            raise UsageError(f"{_MAX_WATCHERS} connections watch already", hint="end one of them")
+            raise UsageError(
+                f"{_MAX_WATCHERS} connections receive the platform's events already",
+                hint="close a fleet page, or a command that follows events",
+            )
         return self._yield_states_and_events(state)
 
     async def _yield_states_and_events(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
@@ -125,7 +128,7 @@ class Operations:
 
     async def _run(self, work: Callable[[], Coroutine[Any, Any, Any]], events: asyncio.Queue[Event]) -> None:
         """Run *work*, and put `OVER` or `FAILED` into *events* when it is done, fails or is cancelled."""
-        last: Event = {"event": FAILED, "message": "the platform ends", "hint": ""}
+        last: Event = {"event": FAILED, "message": "the platform is being stopped", "hint": ""}
         try:
             await work()
             last = {"event": OVER}

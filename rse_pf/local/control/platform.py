@@ -226,8 +226,8 @@ class LocalPlatform:
                 check_listener(host, self._wanted_port, is_protected=self.lan is not None)
             elif previous.lan != self._wanted_address:
                 raise ConfigurationError(
-                    f"servers of platform {self.name!r} still run, with "
-                    f"{previous.lan or 'loopback'} as address",
+                    f"servers of platform {self.name!r} still run, and robots connect to them at "
+                    f"{previous.lan or 'loopback'}, not at {self._wanted_address or 'loopback'}",
                     hint=f"end them with: rse-pf local stop --name {self.name}",
                 )
             if self.lan is not None:
@@ -437,7 +437,7 @@ class LocalPlatform:
                     self._emit("roll-stopped", server=names[0], number=number, of=len(servers))
                     raise ConfigurationError(
                         f"the roll stopped at new server {number} of {len(servers)}: {error.message}",
-                        hint=f"the old ones serve on; look at the log {names[0]}.log, then roll again",
+                        hint=f"the old servers serve on; read the log {names[0]}.log, then roll again",
                     ) from error
                 if old in self._fleet.members:
                     await self.drain(old, reason="rolling replacement")
@@ -597,7 +597,7 @@ class LocalPlatform:
             names = ", ".join(member.name for member in members)
             raise ConfigurationError(
                 f"none of the adopted servers became healthy: {names}",
-                hint="look at their logs, or end them with: rse-pf local stop",
+                hint="read their logs: rse-pf local logs, or stop them: rse-pf local stop",
             )
 
     async def _settings_digest(self, server: ServerState) -> str | None:

@@ -110,7 +110,7 @@ class ControlPort:
                 if status != 200:
                     raise UsageError(
                         str(event.get("message", f"the control plane answers {status}")),
-                        hint=str(event.get("hint", "is it of this version?")),
+                        hint=str(event.get("hint", "use the rse-pf of the platform's version")),
                     )
                 yield event
         except (OSError, EOFError, ValueError, LookupError, asyncio.TimeoutError) as error:
@@ -138,7 +138,7 @@ class ControlPort:
         headers = dict(line.lower().split(": ", 1) for line in head[1:] if ": " in line)
         length = int(headers["content-length"]) if "content-length" in headers else -1
         if not 0 <= length <= _MAX_BODY_BYTES:
-            raise ValueError(f"an answer of {length} bytes")
+            raise ValueError(f"the reply states a length of {length} bytes, not 0 to {_MAX_BODY_BYTES}")
         body = await reader.readexactly(length)
         if headers.get("connection") == "close":
             self.close()
