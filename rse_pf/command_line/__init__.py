@@ -1,4 +1,4 @@
-"""What verbs of the command line share, those of `rse_pf.cli` and those of extensions.
+"""Modules that the verbs of the command line share, those of `rse_pf.cli` and those of extensions.
 
-`options` makes typed requests of what was typed; `extras` knows which packages a verb needs.
+`options` turns the words of a command into a typed request; `extras` lists the packages that each verb needs.
 """

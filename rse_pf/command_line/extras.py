@@ -1,6 +1,6 @@
-"""The extras of this package: which modules each one installs, what it is for, and which verbs need it.
+"""The extras of this package (``pip install 'rse-pf[EXTRA]'``): modules, purpose, and verbs that need them.
 
-A test compares the table with ``pyproject.toml`` and with the verbs of the command line.
+A test compares the tables with ``pyproject.toml`` and with the verbs of the command line.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ __all__ = ["EXTRAS", "VERBS_NEED", "Extra", "extra_of_module", "modules_of", "re
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Extra:
-    """One extra: ``modules`` to packages, further extras that it ``includes``, and what it is for.
+    """One extra of this package.
 
-    ``is_required`` is for what rse-pf local needs.
+    ``modules`` maps the name of each module that the extra installs to its package; modules of the extras
+    that it ``includes`` are not repeated.  ``enables`` says what the extra is for, as part of a sentence.
+    ``is_required`` is whether rse-pf local needs it; then rse-pf doctor fails without it.
     """
 
     modules: dict[str, str]
@@ -29,6 +31,7 @@ class Extra:
 
 
 def _same(*names: str) -> dict[str, str]:
+    """Return module to package for modules that have the name of their package."""
     return {name: name for name in names}
 
 
@@ -93,7 +96,7 @@ EXTRAS: dict[str, Extra] = {
     "experiments": Extra(modules=_same("matplotlib"), enables="figures of experiments", includes=("local",)),
     "aws": Extra(modules=_same("boto3"), enables="everything with --cloud, stores in S3"),
 }  # fmt: skip
-"""Name of each extra, and ``base`` for what is always installed."""
+"""The extras by name; ``base`` is no extra, but the packages that are always installed."""
 
 VERBS_NEED: dict[str, tuple[str, ...]] = {
     "demo": ("demo",),
@@ -133,14 +136,14 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "batch run": ("batch",),
     "replay": ("local",),
 }
-"""Verb, with the action or option that needs more, to extras."""
+"""The extras that each verb needs, and those that it needs with some of its actions and options."""
 
 _OPTIONAL = {"h5py", "yaml"}
-"""Modules without which the verbs work: their readers name the extra at use."""
+"""Modules of extras without which the verbs work: only a file that needs one is refused, with its extra."""
 
 
 def modules_of(extra: str) -> dict[str, str]:
-    """Return module to package of *extra* and of all that it includes, without those that may be missing."""
+    """Return module to package of *extra* and of all extras that it includes, without optional modules."""
     modules = {
         module: package for name in EXTRAS[extra].includes for module, package in modules_of(name).items()
     }
@@ -149,7 +152,7 @@ def modules_of(extra: str) -> dict[str, str]:
 
 
 def require(verb: str) -> None:
-    """Refuse *verb* before any work if it needs a package that is not installed, or OpenCV does not work.
+    """Refuse *verb*, a key of `VERBS_NEED`, if a package that it needs is missing, or OpenCV does not work.
 
     Raises:
         MissingExtra: A package is not installed.
@@ -166,12 +169,13 @@ def require(verb: str) -> None:
 
 
 def extra_of_module(module: str) -> MissingExtra | None:
-    """Return the error for a *module* that could not be imported; None if it belongs to no extra."""
+    """Return the error that names the extra of a missing *module*; None if the module is in no extra."""
     top = module.partition(".")[0]
-    return next(_owners(top), None)
+    return next(_missing_extras(top), None)
 
 
-def _owners(module: str) -> Iterator[MissingExtra]:
+def _missing_extras(module: str) -> Iterator[MissingExtra]:
+    """Yield an error for each extra that has *module*."""
     for name, extra in EXTRAS.items():
         if module in extra.modules:
             yield MissingExtra(extra.modules[module], name)

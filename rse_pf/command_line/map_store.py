@@ -1,7 +1,7 @@
-"""Requests that name a store of maps, the search for it, and the map of a drive that is kept in it.
+"""Options that name the store of maps, the search for that store, and the commit of a drive's map to it.
 
-Without a name the store is that of the settings, else that of the platform that runs on this machine, else
-the folder of ``rse-pf local``.
+If no option names a store, it is that of the setting ``data.store``; if that is ``memory:``, it is that of
+the platform that runs on this machine, else that of the platform ``default``, which ``rse-pf local`` starts.
 """
 
 from __future__ import annotations
@@ -37,7 +37,11 @@ __all__ = [
     "with_store",
 ]
 
-_IN_MEMORY, _FOLDER = "memory:", "dir:"
+# Location of a store in the memory of a process, which no other process can read.
+_IN_MEMORY = "memory:"
+# Prefix of the location of a store that is a folder.
+_FOLDER = "dir:"
+# Folder in a platform's state folder that is the store of a platform with the setting ``memory:``.
 _OBJECTS = "objects"
 _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _NO_NAME = re.compile(r"[^a-z0-9]+")
@@ -45,7 +49,7 @@ _NO_NAME = re.compile(r"[^a-z0-9]+")
 
 @dataclass(frozen=True, kw_only=True)
 class StoreRequest:
-    """Where maps are stored."""
+    """Options of a command on maps: the store, the tenant whose maps they are, and the form of the output."""
 
     store: str | None = option(
         "--store",
@@ -62,17 +66,17 @@ class StoreRequest:
     json: bool = option("--json", help="print JSON")
 
     def settings_with_store(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return the settings with the store of the request; raises UsageError."""
+        """Return *settings* with ``data.store`` of the request; raises UsageError if there is none."""
         if self.store is not None and self.platform is not None:
             raise UsageError("--store and --name name two stores", hint="leave one of them out")
         return with_store(self.store, settings, self.platform)
 
     def open_maps(self, settings: PlatformSettings) -> MapRegistry:
-        """Return the maps of the tenant in the store of the request; raises UsageError."""
+        """Return the maps of the tenant in the store of the request; raises UsageError if there is none."""
         return open_maps(self.settings_with_store(settings), self.tenant)
 
     def print(self, value: Any, *lines: str) -> None:
-        """Print *value* with ``--json``, else *lines*."""
+        """Print *value* as JSON with ``--json``, else *lines*."""
         if self.json:
             show_json(value, indent=2, sort_keys=True)
         else:
@@ -81,21 +85,21 @@ class StoreRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class MapRequest(StoreRequest):
-    """One map."""
+    """The options of a command on one map: its name, and those of the store."""
 
     name: str = option(metavar="MAP", help="name of the map")
 
 
 @dataclass(frozen=True, kw_only=True)
 class VersionRequest(MapRequest):
-    """One version of a map."""
+    """The options of a command on one version of a map; ``head`` is the newest one, or that of a rollback."""
 
     version: str = option(nargs="?", default="head", metavar="VERSION", help="default: %(default)s")
 
 
 @dataclass(frozen=True, kw_only=True)
 class KeepRequest:
-    """Where the map of a drive is kept."""
+    """The options that say in which store, and as which map, the map of a drive is kept."""
 
     objects: Path | None = option(
         "--objects",
@@ -111,12 +115,20 @@ class KeepRequest:
 
 
 def with_store(named: str | None, settings: PlatformSettings, name: str | None = None) -> PlatformSettings:
-    """Return the settings with the store that is *named*, that of the platform *name*, or that is found.
+    """Return *settings* with the ``data.store`` that is to be used.
 
-    A store of a platform comes with the quota of tenants that the platform has.
+    Without *named* and *name* it is that of *settings*, or, if that is ``memory:``, the store of the platform
+    that runs on this machine, else of the platform ``default``.  With the store of a platform,
+    ``data.tenant_quota_bytes`` is that of the platform, too.
+
+    Args:
+        named: Location of a store, such as ``dir:PATH``; None if no option names one.
+        settings: Settings of the command.
+        name: Name of a platform on this machine whose store is used; None if no option names one.
 
     Raises:
-        UsageError: The folder that is named is not there, or there is no such platform, or none was named.
+        UsageError: The folder of the store, or the platform *name*, does not exist; several platforms run and
+            none is named; or no store is named and none is found.
     """
     chosen = settings if named is None else settings.replace(data={"store": named})
     if named is None and (name is not None or chosen.data.store == _IN_MEMORY):
@@ -136,7 +148,7 @@ def with_store(named: str | None, settings: PlatformSettings, name: str | None =
             hint=f"name --store dir:PATH; that of rse-pf local is dir:{own}",
         )
     kind, _, path = chosen.data.store.partition(":")
-    # An empty list of maps would look like an answer.
+    # Refused here: a missing folder would otherwise be shown as a store without maps.
     if kind == "dir" and not Path(path).is_dir():
         raise UsageError(
             f"there is no folder {path[:200]}",
@@ -146,10 +158,10 @@ def with_store(named: str | None, settings: PlatformSettings, name: str | None =
 
 
 def open_maps(settings: PlatformSettings, tenant: str = "default") -> MapRegistry:
-    """Return the maps of a tenant in ``data.store``; changes are recorded in the platform's audit log."""
+    """Return the maps of *tenant* in ``data.store``; each change is recorded in the platform's audit log."""
 
     def record(action: str, name: str, version: MapRecord) -> None:
-        subject = str(RobotId(tenant, name))  # as the data service writes it
+        subject = str(RobotId(tenant, name))  # the same form as in entries of the data service
         record_map_change(settings, action, subject, version=version.id, number=version.number)
 
     max_bytes = 4 * settings.data.max_object_bytes
@@ -157,7 +169,7 @@ def open_maps(settings: PlatformSettings, tenant: str = "default") -> MapRegistr
 
 
 def head_id(name: str, maps: MapRegistry) -> str | None:
-    """Return the id of the newest version of a map, None if there is no such map."""
+    """Return the id of the head, the current version, of map *name*; None if there is no such map."""
     try:
         return maps.head(name).id
     except NotFound:
@@ -165,13 +177,17 @@ def head_id(name: str, maps: MapRegistry) -> str | None:
 
 
 def split_version(word: str) -> tuple[str, str]:
-    """Return the name and the version of ``MAP`` or ``MAP@VERSION``; the version is ``head`` by default."""
+    """Return name and version of *word*, ``MAP`` or ``MAP@VERSION``; without a version, ``head``."""
     name, _, version = word.partition("@")
     return name, version or "head"
 
 
 def map_name(name: str | None, out: Path) -> str:
-    """Return the name of the map of a drive, by default that of its results; raises UsageError."""
+    """Return the name of the map of a drive; if *name* is None, made of the name of the folder *out*.
+
+    Raises:
+        UsageError: *name* has other characters than small letters, digits and hyphens, or is too long.
+    """
     if name is None:
         return _NO_NAME.sub("-", out.absolute().name.lower()).strip("-")[:64].strip("-") or "drive"
     if not _MAP_NAME.fullmatch(name):
@@ -183,9 +199,13 @@ def map_name(name: str | None, out: Path) -> str:
 
 
 def drive_store(folder: Path | None, settings: PlatformSettings) -> PlatformSettings:
-    """Return the settings with the store that keeps the map of a drive, *folder* if it is named.
+    """Return *settings* with the ``data.store`` that keeps the map of a drive.
 
-    A folder that does not exist is created.
+    It is *folder*; if that is None, the store of *settings*; if that is ``memory:``, the store of the
+    platform that runs on this machine, else of ``rse-pf local``.  A folder that does not exist is created.
+
+    Raises:
+        UsageError: The folder cannot be created, or several platforms run and none is named.
     """
     if folder is None and settings.data.store != _IN_MEMORY:
         return settings
@@ -205,11 +225,20 @@ def drive_store(folder: Path | None, settings: PlatformSettings) -> PlatformSett
 def keep_map(
     data: bytes, name: str, settings: PlatformSettings, *, tenant: str, author: str
 ) -> dict[str, Any]:
-    """Make *data* the next version of a map; return ``store`` and ``map`` as ``map export`` takes them.
+    """Commit *data*, an encoded map, as the next version of map *name*; return fields for the report.
+
+    The fields are ``store`` and ``map``, as ``rse-pf map`` takes them, and ``map_version``, the new id.
+
+    Args:
+        data: The encoded map.
+        name: Name of the map.
+        settings: Group data: store and quotas.
+        tenant: Tenant that the map belongs to.
+        author: The program that made the map, for the record of the version.
 
     Raises:
         QuotaExceeded: The tenant would store more than its quota.
-        RsePfError: It was not kept.
+        RsePfError: The map was not stored.
     """
     maps = open_maps(settings, tenant)
     TenantAccount(open_data_store(settings), tenant, settings.data).reserve(len(data))
@@ -220,10 +249,12 @@ def keep_map(
 
 
 def _platform_folder(name: str | None) -> Path:
-    """Return the folder of a platform: of *name*, of the one that runs here, or of ``rse-pf local``.
+    """Return the state folder of the platform *name*; it need not exist.
+
+    If *name* is None, that of the platform that runs on this machine, else of the platform ``default``.
 
     Raises:
-        UsageError: Several run here, and none is named.
+        UsageError: *name* is None and several platforms run here.
     """
     own = state_folder(name or "default", os.environ)
     running = []
@@ -243,7 +274,11 @@ def _platform_folder(name: str | None) -> Path:
 
 
 def _with_store_of(folder: Path, settings: PlatformSettings) -> PlatformSettings:
-    """Return *settings* with the store of the platform in *folder*, and the quota of its tenants."""
+    """Return *settings* with the store and the tenant quota of the platform whose state is in *folder*.
+
+    If the platform's settings cannot be read, or its store is ``memory:``, its folder ``objects`` is the
+    store.
+    """
     try:
         known = platform_settings(folder)
     except ConfigurationError:

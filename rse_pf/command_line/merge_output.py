@@ -1,4 +1,4 @@
-"""What a merge of maps shows while it runs and when it is done, for the verbs map and batch."""
+"""Commit the result of a merge of maps and show it, for the verbs map and batch."""
 
 from __future__ import annotations
 
@@ -22,18 +22,21 @@ def commit_merge(
     origin: MapOrigin,
     json_fields: dict[str, Any] | None,
 ) -> int:
-    """Commit the merged map as a version of *into*, and print what was joined; return the exit code.
+    """Commit the merged map as the next version of map *into*, and print which maps were joined.
+
+    Returns the exit code: 1 if any map was not joined, else 0.
 
     Args:
-        reply: Of the merge.
-        maps: Where the version goes.
-        names: What the user called the maps, in the order of the merge.
-        into: The map that gets a new version.
-        origin: Head before the merge, author, time, and the user's note; an empty note names what was joined.
+        reply: Result of the merge.
+        maps: The maps of the tenant, among which the version is committed.
+        names: The maps that were merged as the user wrote them, in the order of the merge.
+        into: Name of the map that gets the version.
+        origin: Head before the merge, author, time, and the user's note; for an empty note the names of the
+            joined maps are noted.
         json_fields: Further fields of the JSON that is printed; None prints text.
 
     Raises:
-        CommandFailed: No two maps could be joined; nothing is written.
+        CommandFailed: Several maps were merged and no two of them could be joined; nothing is written.
     """
     not_joined = [(names[failure.map], failure.reason) for failure in reply.not_joined]
     if len(names) > 1 and len(reply.joined) < 2:
@@ -75,12 +78,12 @@ def commit_merge(
 
 
 def merge_progress(done: float, what: str) -> None:
-    """Show how much of a merge is done, between 0 and 1, and what is being done."""
+    """Show on the terminal that the part *done* of a merge (0 to 1) is done, and its present step *what*."""
     show_progress(f"{100 * done:3.0f} %  {what}", is_over=done >= 1.0)
 
 
 def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
-    """Return the counts of pairs of keyframes that were rejected, by their maps and reasons."""
+    """Return, for each pair of maps, how many pairs of their keyframes were rejected for each reason."""
     pairs: dict[str, dict[str, int]] = {}
     for refusal in reply.refused:
         between = " and ".join(dict.fromkeys(names[row] for row in refusal.maps))

@@ -1,6 +1,6 @@
-"""Options of the command line as typed requests: frozen dataclasses whose fields declare the options.
+"""Declare options of the command line as the fields of frozen dataclasses, called requests.
 
-An `Action` names the request of a verb, or of one action of it, and the function that takes the request::
+An `Action` is a verb, or one action of a verb; it names the request and the function that is called with it::
 
     @dataclass(frozen=True, kw_only=True)
     class PruneRequest(MapRequest):
@@ -25,7 +25,10 @@ from rse_pf.errors import UsageError
 __all__ = ["Action", "NoOptions", "Parser", "add_action", "option", "perform"]
 
 _CONVERTERS: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Path": Path}
-"""Function that reads the text of an option, by the first type in the annotation of its field."""
+"""Function that converts the text of an option, by the first type name in the annotation of its field.
+
+A type that is missing here, such as ``str``, leaves the text as it is.
+"""
 _HELP = (["-h"], ["--help"])
 _CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known>.*)\)")
 
@@ -34,9 +37,11 @@ _CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known
 class Action:
     """A verb, or one action of a verb: either a request and the function that takes it, or further actions.
 
-    ``run`` takes the request and the settings, and returns the exit code; None means 0.  ``default`` names
-    the action of a verb that is meant if none is named.  ``description`` opens the help page of the action;
-    without one it is ``help``, the line in the list of actions.
+    ``request`` is the dataclass whose fields are the options.  ``run`` is called with the request and the
+    settings, and returns the exit code; None means 0.  ``actions`` are the further actions by name, and
+    ``default`` names the one that runs if the command names none.  ``help`` is the line in the list of
+    actions; ``description`` opens the help page of the action, and is ``help`` if it is empty; ``example``
+    closes it.
     """
 
     help: str = ""
@@ -54,13 +59,14 @@ class NoOptions:
 
 
 def option(*flags: str, default: Any = None, section: str = "", exclusive: str = "", **keywords: Any) -> Any:
-    """Return a field of a request that is read from the command line, by default as a positional argument.
+    """Return a dataclass field that declares an option, or without *flags* a positional argument.
 
-    The annotation of the field gives the type of the value; ``bool`` is a flag that takes no value.
-    The module of the request must have ``from __future__ import annotations``.
+    The annotation of the field gives the type of the value; ``bool`` is a flag that takes no value, and that
+    inverts *default*.  The module of the request must have ``from __future__ import annotations``.
 
     Args:
-        flags: Names such as ``--out``; none for a positional argument, which has the name of the field.
+        flags: Names of the option such as ``--out``; none for a positional argument, which has the name of
+            the field.
         default: Value of an option that is not given.
         section: Heading under which the help page lists the option.
         exclusive: At most one of the options with the same word here may be given.
@@ -76,16 +82,19 @@ class Parser(argparse.ArgumentParser):
     """Raises UsageError where `argparse.ArgumentParser` prints an error and exits."""
 
     typed: Sequence[str] = ()
-    """The words that are parsed."""
+    """The words that are parsed now, for the hints of `error`."""
 
     siblings: Mapping[str, Parser] = {}
     """The parsers of the actions of this verb, or of the verb that this action belongs to, by name."""
 
     default_action: str = ""
-    """The action that is meant if the first word names none."""
+    """Name of the action that is put before the words if the first word is an option; "" for none."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse all words, and refuse what this parser does not know, also as the parser of an action."""
+        """Parse *args* (None: those of the process), and raise UsageError for words that are unknown.
+
+        The parser of an action refuses them itself, so that the error names the action.
+        """
         words = list(sys.argv[1:] if args is None else args)
         first = words[0] if words else ""
         skipped = 2 if first == "--settings" else int(first.startswith("--settings="))
@@ -99,7 +108,7 @@ class Parser(argparse.ArgumentParser):
         return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
-        """Raise what is wrong, with the option or word that was perhaps meant."""
+        """Raise UsageError for the *message* of argparse; the hint names a similar option or word, if any."""
         choice = _CHOICE.search(message)
         if choice:
             known = [word.strip(" '\"") for word in choice["known"].split(",")]
@@ -109,7 +118,8 @@ class Parser(argparse.ArgumentParser):
             )
         unknown = re.search(r"unrecognized arguments: ([^\s=]*)", message)
         word = unknown[1] if unknown else ""
-        if "arguments are required" in message:  # perhaps because of an option that does not exist
+        # A misspelt option may be the reason why a required one is missing: name the first unknown option.
+        if "arguments are required" in message:
             options = {*self._option_string_actions, *self._options_of_actions()}
             typed = (each.partition("=")[0] for each in self.typed if each.startswith("--"))
             word = next((each for each in typed if each.strip("-") and each not in options), "")
@@ -130,6 +140,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def _hint_for(self, option: str) -> str:
+        """Return a hint for an unknown *option*: the actions that have it, else a similar option."""
         others = [name for name, parser in self.siblings.items() if option in parser._option_string_actions]
         if option and others:
             return f"{option} is an option of {', '.join(others)}; see {self.prog} --help"
@@ -142,7 +153,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_action(parser: Parser, action: Action) -> None:
-    """Declare the options of an action, or the parsers of its actions with theirs."""
+    """Add the options of *action* to *parser*, or a parser for each of its actions, with their options."""
     if not action.actions:
         _add_options(parser, action.request)
         parser.set_defaults(chosen=action)
@@ -166,7 +177,7 @@ def add_action(parser: Parser, action: Action) -> None:
 
 
 def add_settings(parser: Parser, default: Any = None) -> None:
-    """Declare the option that names the file of settings."""
+    """Add the option --settings to *parser*, with *default* as the value if it is not given."""
     parser.add_argument(
         "--settings",
         type=Path,
@@ -177,7 +188,7 @@ def add_settings(parser: Parser, default: Any = None) -> None:
 
 
 def perform(parsed: argparse.Namespace, settings: Any) -> int:
-    """Build the request of the action that was parsed, run the action, and return its exit code."""
+    """Build the request of the action in *parsed*, run the action, and return its exit code."""
     action: Action = parsed.chosen
     assert action.run is not None
     given = vars(parsed)
@@ -187,6 +198,7 @@ def perform(parsed: argparse.Namespace, settings: Any) -> int:
 
 
 def _add_options(parser: Parser, request: Any) -> None:
+    """Add an option to *parser* for each field of the dataclass *request* that `option` made."""
     groups: dict[str, Any] = {}
     for each in fields(request):
         if "flags" not in each.metadata:
@@ -200,6 +212,7 @@ def _add_options(parser: Parser, request: Any) -> None:
 
 
 def _add_option(group: Any, declared: Field[Any]) -> None:
+    """Add the option of the field *declared* to *group*, with type and action by the field's annotation."""
     flags, keywords = declared.metadata["flags"], dict(declared.metadata["keywords"])
     if not isinstance(declared.type, str):
         raise TypeError(f"the module of the field {declared.name} has no postponed annotations")

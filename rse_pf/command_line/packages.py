@@ -1,7 +1,7 @@
-"""Find what is wrong with an installed package: its version, another package in its folder, or its use.
+"""Find the defect of an installed package: a wrong version, a second package in its folder, or a failing use.
 
-The declared versions are those of the metadata of rse-pf.  A package is imported and called once, since a
-damaged package, or a folder that hides it, can often be imported.
+The required versions are those in the metadata of rse-pf.  A package is imported and called once, since a
+damaged package, or a folder of the same name that hides it, can often be imported without an error.
 """
 
 from __future__ import annotations
@@ -23,14 +23,22 @@ __all__ = ["Defect", "find_defect", "find_misuse"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Defect:
-    """What is wrong with a package, and the command that repairs it; empty: its extra is not installed."""
+    """What is wrong with a package.
+
+    ``fix`` is the shell command that repairs it; "" if it is not installed, and its extra has to be
+    installed.
+    """
 
     problem: str
     fix: str = ""
 
 
 def find_defect(module: str, package: str) -> Defect | None:
-    """Return what is wrong with *module* of *package*; None if nothing is."""
+    """Return the defect of *module*, which *package* installs; None if it has none.
+
+    Checked in this order: whether the module can be found, is installed by this package alone, has a required
+    version, and works (`find_misuse`).
+    """
     if importlib.util.find_spec(module) is None:
         return Defect(problem=f"{module} cannot be imported")
     installed = {name: metadata.version(name) for name in _owners_of().get(module, ())}
@@ -52,7 +60,7 @@ def find_defect(module: str, package: str) -> Defect | None:
 
 
 def find_misuse(module: str, package: str) -> Defect | None:
-    """Import *module* and call it; return what is wrong if that fails."""
+    """Import *module* and make one small call of it; return the defect if that fails, else None."""
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # numpy prints a page for an extension of another ABI
             made = importlib.import_module(module)
@@ -74,7 +82,7 @@ def _reinstall(package: str) -> str:
 
 
 def _is_part_of(package: str, place: str) -> bool:
-    """Return whether *place* lies where *package* is installed, so that pip replaces it."""
+    """Return whether the path *place* is where *package* is installed, so that pip replaces it."""
     try:
         return Path(str(metadata.distribution(package).locate_file(Path(place).name))) == Path(place)
     except metadata.PackageNotFoundError:
@@ -115,19 +123,22 @@ _CALLS: Mapping[str, Callable[[Any], object]] = {
         )
     },
 }  # fmt: skip
-"""Module to a call of it that needs its compiled parts, or an import of them."""
+"""For each module, a function that is called with it: a small use, or an import, of its compiled parts."""
 
 
 @functools.cache
 def _owners_of() -> Mapping[str, list[str]]:
-    """Return module to the distributions that install it."""
+    """Return, for each module, the names of the installed distributions that contain it."""
     owners = metadata.packages_distributions()
     return {module: [_normal(name) for name in names if name] for module, names in owners.items()}
 
 
 @functools.cache
 def _declared() -> dict[str, str]:
-    """Return package to declared versions, such as ``>=4.10,<5``; empty if rse-pf has no metadata."""
+    """Return the required versions of each package, such as ``>=4.10,<5``, by its normal name.
+
+    Empty if rse-pf itself is not installed, and so has no metadata.
+    """
     try:
         lines = metadata.requires("rse-pf") or []
     except metadata.PackageNotFoundError:
@@ -137,12 +148,12 @@ def _declared() -> dict[str, str]:
 
 
 def _normal(name: str) -> str:
-    """Return *name* as package indexes write it (PEP 503)."""
+    """Return the package name *name* in its normal form (PEP 503)."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _is_in(version: str, wanted: str) -> bool:
-    """Return whether *version* is one of *wanted*; only ``>=``, ``<`` and ``==`` restrict it."""
+    """Return whether *version* meets the requirement *wanted*; only ``>=``, ``<`` and ``==`` count."""
     number = _number(version)
     for operator, limit in re.findall(r"(>=|==|<)\s*([^,\s]+)", wanted):
         bound = _number(limit)
@@ -154,7 +165,7 @@ def _is_in(version: str, wanted: str) -> bool:
 
 
 def _number(version: str) -> list[int]:
-    """Return the release segment of *version*, without zeros at its end."""
+    """Return the numbers of the release in *version*, without zeros at the end: ``4.10.0rc1`` is [4, 10]."""
     release = re.match(r"[0-9]+(?:\.[0-9]+)*", version)
     number = [int(part) for part in release[0].split(".")] if release else []
     while number and number[-1] == 0:

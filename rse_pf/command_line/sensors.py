@@ -1,4 +1,4 @@
-"""The options that say which sensors of a drive are used, and whether it is checked; lines on its source."""
+"""Options that select the sensors of a recording and the checks of a drive, and the notes on its source."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["AcceptRequest", "CheckRequest", "SensorRequest", "show_source"]
 
 @dataclass(frozen=True, kw_only=True)
 class SensorRequest:
-    """Which sensors of a recording are used; None means those that it has."""
+    """Options that select the sensors of a recording; None uses all that it has."""
 
     camera: Literal["stereo", "left"] | None = option(
         "--camera",
@@ -32,7 +32,7 @@ class SensorRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptRequest:
-    """Which findings about the source of a drive are accepted."""
+    """The option that accepts findings about the source of a drive, so that they are no longer reported."""
 
     accept: tuple[str, ...] = option(
         "--accept",
@@ -45,16 +45,16 @@ class AcceptRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckRequest(AcceptRequest):
-    """Whether a drive is checked while it is tracked."""
+    """The option that switches off the checks of a drive while it is tracked, and the accepted findings."""
 
     check: bool = option("--no-check", default=True, help="do not check calibration, times and images")
 
 
 def show_source(notes: Iterable[str], doubts: Iterable[Doubt]) -> tuple[str, ...]:
-    """Show what was assumed about a source, and what is unlikely, before it is used.
+    """Write the notes on what was assumed about a source, and the findings about it, to standard error.
 
     Returns:
-        The lines of the doubts, which need not be shown again.
+        The lines of the findings (*doubts*) that were written, so that they are not shown again.
     """
     lines = tuple(doubt.line() for doubt in doubts)
     show(*(f"note: {note}" for note in notes), *lines, error=True)
