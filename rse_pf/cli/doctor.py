@@ -29,34 +29,44 @@ from rse_pf.terminal import show
 
 __all__ = ["ACTION", "Finding", "check_machine", "report"]
 
+# File descriptors that the load balancer needs for each robot: one towards the robot, one towards its server.
 _DESCRIPTORS_PER_ROBOT = 2
+# File descriptors that the load balancer needs besides those of robots.
 _OTHER_DESCRIPTORS = 256
+# Available memory below which a warning is printed, in MiB: about what the demo needs.
 _LITTLE_MEMORY_MIB = 1024
-_ENVOY_ANSWERS_S = 10.0
+# Time limit of ``envoy --version``, in seconds.
+_ENVOY_TIMEOUT_S = 10.0
 _ISOLATION_FIX = "allow user namespaces: sysctl -w user.max_user_namespaces=10000"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One line: ``grade`` is ok, warn or fail; ``fix`` is how to repair it, empty if it is ok."""
+    """The result of one check: ``grade`` is ok, warn or fail, ``what`` the sentence that is shown.
+
+    ``fix`` is what the user can do, "" if the grade is ok.
+    """
 
     grade: str
     what: str
     fix: str = ""
 
     def lines(self) -> list[str]:
-        """Return what is shown to a user."""
+        """Return the lines that show this result: one, or two with a fix."""
         return [f"{self.grade:<4}  {self.what}", *([f"      fix: {self.fix}"] if self.fix else [])]
 
 
 def check_this_machine(request: NoOptions, settings: PlatformSettings) -> int:
-    """Print every finding; 1 if something required failed."""
+    """Check this machine and print every result; return 1 if any failed, else 0."""
     has_demo = find_defect("cv2", EXTRAS["demo"].modules["cv2"]) is None
     return report(check_machine(settings), f"ready: rse-pf local{', or rse-pf demo' if has_demo else ''}")
 
 
 def report(findings: Iterable[Finding], ready: str) -> int:
-    """Print *findings* as they come, then how many failed, or *ready*; return the exit code."""
+    """Print each of *findings* when it is known, then how many failed, or the line *ready* if none did.
+
+    Returns the exit code: 1 if any failed, else 0.
+    """
     failed = 0
     for finding in findings:
         show(*finding.lines())
@@ -66,7 +76,7 @@ def report(findings: Iterable[Finding], ready: str) -> int:
 
 
 def check_machine(settings: PlatformSettings) -> Iterator[Finding]:
-    """Yield what is found, in the order in which it should be fixed."""
+    """Check this machine for the platform, and yield the results in the order in which to fix them."""
     checks: tuple[Callable[[PlatformSettings], Iterator[Finding]], ...] = (
         _system, _extras, _solver, _isolation, _balancer, _listener, _open_files, _size,
     )  # fmt: skip
@@ -82,7 +92,7 @@ def _system(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _extras(settings: PlatformSettings) -> Iterator[Finding]:
-    """Yield a line for each extra, and then which verbs work and which do not."""
+    """Yield one result for each extra, one with the verbs that work, and one for each verb that does not."""
     packages = {module: name for extra in EXTRAS.values() for module, name in extra.modules.items()}
     found = {module: find_defect(module, package) for module, package in packages.items()}
     defects = {module: defect for module, defect in found.items() if defect is not None}
@@ -99,6 +109,7 @@ def _extras(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _verbs(defects: Mapping[str, Defect]) -> Iterator[Finding]:
+    """Yield which verbs work if the modules in *defects* do not, and a warning for each other verb."""
     lacking = {
         verb: [extra for extra in extras if defects.keys() & modules_of(extra).keys()]
         for verb, extras in VERBS_NEED.items()
@@ -125,6 +136,7 @@ def _solver(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _isolation(settings: PlatformSettings) -> Iterator[Finding]:
+    """Yield the kinds of isolation that sandboxes of custom services have here; a warning if some lack."""
     from rse_pf.server.sandbox import isolation
     from rse_pf.server.sandbox.child import readable_paths
 
@@ -152,7 +164,7 @@ def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
     try:
         binary = envoy_binary()
         completed = subprocess.run(
-            [binary, "--version"], capture_output=True, text=True, timeout=_ENVOY_ANSWERS_S, check=True
+            [binary, "--version"], capture_output=True, text=True, timeout=_ENVOY_TIMEOUT_S, check=True
         )
     except MissingExtra as error:
         yield Finding(grade="fail", what=error.message, fix=error.hint)
@@ -213,7 +225,7 @@ def _size(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:
-    """Return what is ok if it needs no *fix*; else it warns, or fails if it *is_required*."""
+    """Return the result *what*: ok if *fix* is "", else a warning, or a failure if *is_required*."""
     grade = "fail" if is_required else "warn"
     return Finding(grade=grade if fix else "ok", what=what, fix=fix)
 

@@ -39,7 +39,7 @@ command line prints the name of the class. `rse-pf errors CODE` prints a section
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
-    """What an operator or a developer needs to know about one code."""
+    """The explanation of one error: its code, the name of its class, and four texts from its docstring."""
 
     code: str
     name: str
@@ -51,14 +51,14 @@ class Explanation:
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorsRequest:
-    """The error that is explained; None means all of them."""
+    """The options of rse-pf errors: the code or class name of one error, None for all, and the output."""
 
     code: str | None = option(nargs="?", metavar="CODE", help="such as no-consensus, or NoConsensus")
     markdown: bool = option("--markdown", help="print docs/errors.md")
 
 
 def show_errors(request: ErrorsRequest, settings: PlatformSettings) -> None:
-    """Print one explanation, all codes, or the page."""
+    """Print the explanation of one error, the list of all, or, with --markdown, the page docs/errors.md."""
     explained = explanations()
     if request.markdown:
         if request.code is not None:
@@ -94,14 +94,18 @@ def show_errors(request: ErrorsRequest, settings: PlatformSettings) -> None:
 
 
 def explanations() -> list[Explanation]:
-    """Return the explanation of every code, in the order of the codes."""
+    """Return the explanations of all errors in `rse_pf.errors`, sorted by code."""
     public = [getattr(errors, name) for name in errors.__all__]
     kinds = [value for value in public if isinstance(value, type) and issubclass(value, RsePfError)]
     return sorted(map(explain, kinds), key=lambda explanation: explanation.code)
 
 
 def explain(kind: type[RsePfError]) -> Explanation:
-    """Return what the docstring of *kind* says; raises ValueError if a part is missing or empty."""
+    """Return the explanation in the docstring of the error class *kind*.
+
+    Raises:
+        ValueError: The docstring lacks its sentence, Cause:, Check: or Fix:.
+    """
     match = _PARTS.fullmatch(kind.__doc__ or "")
     if match is None:
         raise ValueError(f"the docstring of {kind.__name__} needs a sentence, Cause:, Check: and Fix:")
@@ -110,7 +114,7 @@ def explain(kind: type[RsePfError]) -> Explanation:
 
 
 def errors_page(explained: Iterable[Explanation]) -> str:
-    """Return ``docs/errors.md``: a section with an anchor for each code."""
+    """Return the text of ``docs/errors.md``: an introduction, and a section for each of *explained*."""
     sections = (
         f"\n## {explanation.code}\n\n`{explanation.name}`: {explanation.meaning}\n\n"
         f"- **Cause:** {explanation.cause}\n- **Check:** {explanation.check}\n- **Fix:** {explanation.fix}\n"

@@ -49,7 +49,7 @@ VERBS = {
     "doctor": "check what this machine needs, and say how to fix it",
     "errors": "explain an error by its code: cause, check, fix",
 }
-"""Verb and one line of help."""
+"""One line of help for each verb, in the order of the front page."""
 
 _MODULES = {
     "demo": "rse_pf.extensions.experiments.demo.command",
@@ -83,9 +83,13 @@ _REFUSED = re.compile(r"[a-z]+\.(?P<name>[a-z_]+) = .* is (below|above|not one o
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code."""
-    # Before a verb imports numpy.  A second thread of BLAS would change the last bits of a map, so that the
-    # replay of a log would differ from the map server; and a robot's matrices are small: it would only spin.
+    """Run the verb in *argv* (None: the words of this process), and return the exit code.
+
+    An error of the platform, of the system or of a missing package is printed as two lines.
+    """
+    # Restrict BLAS to one thread, before a verb imports numpy.  With more threads the last bits of a map
+    # would differ, so that the replay of a log would differ from the map server; and the matrices are so
+    # small that further threads would only wait, and take CPU time.
     os.environ.update(ONE_THREAD)
     words = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -96,7 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _EXIT_INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output is gone: the rest goes to /dev/null, so that the exit does not fail.
+        # The program that reads standard output has exited: send what is left to /dev/null, or Python would
+        # fail when it writes it at the exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_PIPE
     except ModuleNotFoundError as error:
@@ -133,6 +138,7 @@ def parser_of(name: str) -> Parser:
 
 
 def _run(words: list[str]) -> int:
+    """Run the verb in *words*, or print the front page, a help page or the version; return the exit code."""
     if not words or words[0] in ("-h", "--help", "help"):
         show_page(_front_page())
         return _EXIT_OK
@@ -159,7 +165,7 @@ def _run(words: list[str]) -> int:
 
 
 def _hint_for_option(error: SettingsError, words: list[str]) -> str:
-    """Return the hint of *error*; if the refused value was typed, and is in no file, name its option."""
+    """Return the hint of *error*; it names the option if the refused value came from an option in *words*."""
     refused = _REFUSED.match(error.message)
     option = "" if refused is None else f"--{refused['name'].replace('_', '-')}"
     if refused is not None and any(word == option or word.startswith(f"{option}=") for word in words):
@@ -181,7 +187,10 @@ def _front_page() -> str:
 
 
 def _missing_extra(error: ModuleNotFoundError) -> RsePfError:
-    """Return which extra lacks; raises *error* itself if the module belongs to none: that is a defect."""
+    """Return the error that names the extra of the missing module.
+
+    Raises *error* itself if the module belongs to no extra: then rse-pf has a defect.
+    """
     from rse_pf.command_line.extras import extra_of_module
 
     missing = extra_of_module(error.name or "")
@@ -191,6 +200,7 @@ def _missing_extra(error: ModuleNotFoundError) -> RsePfError:
 
 
 def _report(error: RsePfError) -> int:
+    """Print *error*, and return the exit code: 2 for a wrong call or settings, else 1."""
     show_error(error)
     return _EXIT_USAGE if isinstance(error, ConfigurationError) else _EXIT_FAILED
 

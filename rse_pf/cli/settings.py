@@ -22,7 +22,7 @@ __all__ = ["ACTION"]
 
 @dataclass(frozen=True, kw_only=True)
 class SettingsRequest:
-    """The settings that are shown, and how."""
+    """The options of rse-pf settings: which group or setting is shown, and in which format."""
 
     group: str | None = option(
         nargs="?",
@@ -33,7 +33,7 @@ class SettingsRequest:
 
 
 def show_settings(request: SettingsRequest, settings: PlatformSettings) -> None:
-    """Print the table."""
+    """Print the settings as a table, as JSON or as the page docs/settings.md, or their digest."""
     values = settings.to_dict()
     if request.group == "digest":
         show(settings.digest())
@@ -55,7 +55,11 @@ def show_settings(request: SettingsRequest, settings: PlatformSettings) -> None:
 
 
 def _choose(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the group, or the single setting ``group.name``, that *word* names."""
+    """Return, of *values*, the group *word*, or only the setting *word* if it is ``group.name``.
+
+    Raises:
+        UsageError: There is no such group or setting.
+    """
     group, dot, name = word.partition(".")
     if group not in values:
         raise UsageError(f"no group named {group[:80]!r}", hint=f"groups are {', '.join(values)}")

@@ -1,4 +1,4 @@
-"""The verbs robot, token and audit: who may connect, and what was done.
+"""The verbs robot, token, tenant and audit: who may connect and store what, and the log of what was done.
 
-What a person reads and types belongs here; the work is in `rse_pf.auth` and `rse_pf.audit`.
+Options and printed text belong here; the work is in `rse_pf.auth` and `rse_pf.audit`.
 """

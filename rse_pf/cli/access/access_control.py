@@ -1,7 +1,7 @@
-"""Which platform, tenant and robot a command of an operator means, and the record of what it did.
+"""Options that name a platform, a tenant and a robot, the lookup of that robot, and the record of a change.
 
-A command that changes a robot is refused unless that robot is there: a wrong name or a tenant that was left
-out must not look like a success.
+A command that changes a robot is refused unless that robot exists: after a wrong name, or without the tenant,
+it must not report a success.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ __all__ = [
 NOT_ENROLLED_HINT = (
     "rse-pf robot list shows who is; add --not-enrolled for a robot that uses tokens of rse-pf token issue"
 )
+# Name of the local platform if --name is not given.
 _PLATFORM = "default"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlatformRequest:
-    """Which platform is meant: a local one, or the deployment on AWS."""
+    """The options that name the platform of a command: a local one, or with --cloud the deployment on AWS."""
 
     cloud: bool = option("--cloud", help="use the deployment on AWS in cloud.region")
     name: str = option("--name", default=_PLATFORM, help=f"name of the local platform (default: {_PLATFORM})")
@@ -47,13 +48,17 @@ class PlatformRequest:
 
     @property
     def as_option(self) -> str:
-        """The option that names the platform in another command, after a space."""
+        """The option, after a space, that names this platform in a command; "" for the default platform."""
         if self.cloud:
             return " --cloud"
         return "" if self.name == _PLATFORM else f" --name {self.name}"
 
     def open_access_control(self, settings: PlatformSettings) -> AccessControlStore:
-        """Return the access control store of the platform; raises UsageError if there is none."""
+        """Return the store of roster and deny list of the platform.
+
+        Raises:
+            UsageError: There is no such local platform.
+        """
         if self.cloud:
             from rse_pf.aws.account import open_account
             from rse_pf.aws.storage.key_store import open_key_store
@@ -72,14 +77,22 @@ class PlatformRequest:
         return access_control_store(self.folder)
 
     def record(self, action: str, subject: str, **detail: Value) -> None:
-        """Write an action to the audit log of a local platform; in a cloud the bucket keeps all versions."""
+        """Write an entry to the audit log of a local platform; with --cloud, nothing is written.
+
+        On AWS the bucket keeps every version of roster and deny list.
+
+        Args:
+            action: What was done, such as ``robot.enrolled``.
+            subject: The robot, tenant or key that was changed.
+            detail: Further fields of the entry.
+        """
         if not self.cloud:
             record(self.folder, action, subject, **detail)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TenantRequest(PlatformRequest):
-    """Which tenant of a platform is meant; None if it is not named."""
+    """The options that name a platform and a tenant; ``tenant`` is None if it is not named."""
 
     tenant: str | None = option(
         "--tenant",
@@ -89,7 +102,7 @@ class TenantRequest(PlatformRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotRequest(TenantRequest):
-    """Which robot of a platform is meant."""
+    """The options and the argument that name a robot of a platform."""
 
     robot: str = option(metavar="ROBOT", help="name of the robot, as in its tokens and logs")
 
@@ -97,19 +110,21 @@ class RobotRequest(TenantRequest):
 def choose_robot(
     name: str, tenant: str | None, listed: Iterable[EnrolledRobot | DisabledRobot], *, state: str, hint: str
 ) -> str:
-    """Return the tenant of the robot that a command means.
+    """Return the tenant of the robot *name*, which the command changes.
 
-    Without a *tenant* the robot must be listed in the default tenant, and in no other one.
+    If the command names no tenant, a robot of this name must be listed in the default tenant, and in no
+    other.
 
     Args:
-        name: Of the robot.
-        tenant: That the command names, None if it names none.
+        name: Name of the robot.
+        tenant: The tenant that the command names; None if it names none.
         listed: The robots that the command can change.
-        state: In which they are: enrolled or disabled.
-        hint: What to do if none of them has this name.
+        state: The state of these robots for messages: ``enrolled`` or ``disabled``.
+        hint: Hint of the error if no tenant has such a robot.
 
     Raises:
-        UsageError: There is no such robot, or several tenants have one.
+        UsageError: No such robot is listed for the tenant; or no tenant is named, and another than the
+            default tenant has a robot of this name.
     """
     check_robot(name)
     wanted = tenant_or_default(tenant)
@@ -126,10 +141,12 @@ def choose_robot(
 
 
 def read_quotas(words: Iterable[str]) -> dict[str, float]:
-    """Return the quotas in the options ``--quota NAME=N``; without those whose N is ``default``.
+    """Return the quotas by name, from the values ``NAME=N`` of --quota.
+
+    A quota with the value ``default`` is left out, so that the settings apply.
 
     Raises:
-        UsageError: One of them is no quota.
+        UsageError: A word is no quota: its name is unknown, or N is no number or out of bounds.
     """
     quotas: dict[str, float] = {}
     for word in words:
@@ -147,15 +164,15 @@ def read_quotas(words: Iterable[str]) -> dict[str, float]:
 
 
 def tenant_or_default(tenant: str | None) -> str:
-    """Return the tenant that a command names, or the default one; raises UsageError."""
+    """Return *tenant*, or the default tenant if it is None; raises UsageError if the name is not valid."""
     return check_tenant(DEFAULT_TENANT if tenant is None else tenant)
 
 
 def described(robot: str, tenant: str) -> str:
-    """Return a robot as messages name it, always with its tenant."""
+    """Return the words by which messages name a robot: ``robot 'NAME' of tenant 'TENANT'``."""
     return f"robot {robot!r} of tenant {tenant!r}"
 
 
 def max_token_s(settings: PlatformSettings) -> float:
-    """Return the longest time for which a token may be valid after it was issued, in seconds."""
+    """Return the longest time for which servers accept a token after it was issued, in seconds."""
     return float(settings.auth.token_ttl_s + settings.auth.leeway_s)

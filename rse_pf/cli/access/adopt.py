@@ -1,7 +1,8 @@
-"""Give a robot what is stored under an older identity of it, because an operator says that it is the same.
+"""Move what a robot has stored under an earlier identity to its present one, as an operator requests.
 
-A robot that had no key stored under its name alone, and one that was enrolled with a new key under the old
-key.  A server never decides by itself that two identities are one robot.
+The data of a robot is stored under its name and the id of its key.  After a robot gets its first key, or a
+new one, its earlier data is therefore under another identity: its name alone, or its name with the old key.
+A server never decides by itself that two identities are one robot.
 """
 
 from __future__ import annotations
@@ -25,15 +26,17 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["AdoptRequest", "Adopted", "adopt", "run_adopt"]
 
+# Location of a store in the memory of a process, which this command cannot read.
 _PRIVATE_STORE = "memory:"
+# A key's thumbprint (RFC 7638): SHA-256 in base64url, without padding.
 _THUMBPRINT = re.compile(r"[A-Za-z0-9_-]{43}")
-
+# An object is copied in pieces of this size, in bytes, so that a large one does not fill the memory.
 _PIECE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdoptRequest(RobotRequest):
-    """A robot, and the earlier identity whose data it gets."""
+    """The options that name a robot, the earlier identity whose data it gets, and the store of the data."""
 
     from_key: str = option(
         "--from-key",
@@ -52,7 +55,10 @@ class AdoptRequest(RobotRequest):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Adopted:
-    """What was moved: objects, their bytes, snapshots of services, and the services that have a newer one."""
+    """What was moved: the number of objects, their bytes, and the number of snapshots of services.
+
+    ``kept`` names the services whose snapshot was not moved, since the robot has another one already.
+    """
 
     objects: int
     object_bytes: int
@@ -64,14 +70,15 @@ def run_adopt(request: AdoptRequest, tenant: str, settings: PlatformSettings, ro
     """Do ``rse-pf robot adopt``, print what was moved, and return it.
 
     Args:
-        request: The robot, its earlier key and the store.
-        tenant: Of the robot.
+        request: The robot's name, its earlier key and the store.
+        tenant: Tenant of the robot.
         settings: Group data, for the store.
-        roster: The robot is who is enrolled there under its name now, or else who has tokens of the platform.
+        roster: The enrolled robots.  If a robot of this name is enrolled, the data is moved to the identity
+            with its present key, else to the identity of the name alone.
 
     Raises:
-        UsageError: The store belongs to another process.
-        StoreError: The store failed in between; the same command continues.
+        UsageError: The earlier key is no key id, or the store is in the memory of another process.
+        StoreError: The store failed; the same command, given again, moves the rest.
     """
     enrolled = roster.find(tenant, request.robot)
     robot = RobotId(tenant, request.robot) if enrolled is None else enrolled.id
@@ -88,6 +95,7 @@ def run_adopt(request: AdoptRequest, tenant: str, settings: PlatformSettings, ro
 
 
 def _thumbprint(key_id: str) -> str:
+    """Return the thumbprint in the key id *key_id*, "" for ""; raises UsageError if it is no key id."""
     thumbprint = key_id.removeprefix(ROBOT_KEY)
     if key_id and not _THUMBPRINT.fullmatch(thumbprint):
         raise UsageError(
@@ -98,6 +106,7 @@ def _thumbprint(key_id: str) -> str:
 
 
 def _open_store(request: AdoptRequest, settings: PlatformSettings) -> ObjectStore:
+    """Return the store of --store, else of the local platform, else of the settings; raises UsageError."""
     if request.store is None and not request.cloud and request.folder.is_dir():
         settings = with_store(None, settings, request.name)
         kind, _, folder = settings.data.store.partition(":")
@@ -113,17 +122,18 @@ def _open_store(request: AdoptRequest, settings: PlatformSettings) -> ObjectStor
 
 
 def adopt(store: ObjectStore, robot: RobotId, *, source: RobotId) -> Adopted:
-    """Move what is stored for *source* to *robot*; after an interruption, the next call continues.
+    """Move objects, charges and snapshots of services that are stored for *source* to *robot*.
 
-    A snapshot that *robot* has already stays, and the older one is left where it is.
+    Each is copied and then deleted, so that a second call moves what an interrupted one has left.  Where
+    *robot* has another snapshot of a service already, both snapshots stay where they are.
 
     Args:
-        store: Of the platform.
-        robot: Who gets it.
-        source: Who it was stored for.
+        store: Store of the platform.
+        robot: The identity that gets the data.
+        source: The identity under which the data is stored.
 
     Raises:
-        StoreError: The store failed in between.
+        StoreError: The store failed; a part of the data may have been moved.
     """
     objects = object_bytes = snapshots = 0
     kept: list[str] = []
@@ -153,11 +163,13 @@ def adopt(store: ObjectStore, robot: RobotId, *, source: RobotId) -> Adopted:
 
 
 def _pieces(store: ObjectStore, name: str, size: int) -> Iterator[bytes]:
+    """Yield the content of the object *name*, of *size* bytes, in pieces of `_PIECE_BYTES`."""
     for start in range(0, size, _PIECE_BYTES):
         yield store.get_range(name, start, _PIECE_BYTES)
 
 
 def _is_equal(store: ObjectStore, name: str, other: str) -> bool:
+    """Return whether the objects *name* and *other* have the same content; False if one is missing."""
     with contextlib.suppress(NotFound):
         return store.get(name) == store.get(other)
     return False

@@ -34,6 +34,7 @@ from rse_pf.terminal import show
 
 __all__ = ["ACTION"]
 
+# A value of an entry that is printed without quotes: printable ASCII without spaces.
 _PLAIN = re.compile(r"[!-~]+")
 
 
@@ -49,7 +50,7 @@ class _ShowRequest(PlatformRequest):
 
 
 def show_log(request: _ShowRequest, settings: PlatformSettings) -> None:
-    """Show the audit log."""
+    """Print the entries of the audit logs of a local platform, of files, or with --cloud of the bucket."""
     if request.last is not None and request.last < 1:
         raise UsageError(f"--last {request.last} shows no entry", hint="give 1 or more")
     if request.cloud:
@@ -61,7 +62,7 @@ def show_log(request: _ShowRequest, settings: PlatformSettings) -> None:
 
 
 def _show_cloud(request: _ShowRequest, settings: PlatformSettings) -> None:
-    """Fetch the logs in the bucket, and show them as those of any folder."""
+    """Copy the logs in the bucket into --out, else into a temporary folder, and print their entries."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.storage.audit_archive import fetch_audit, open_audit_archive
 
@@ -88,7 +89,11 @@ def _show(request: _ShowRequest, files: Sequence[Path]) -> None:
 
 
 def _files(request: _ShowRequest) -> Sequence[Path]:
-    """Return the files that the command names, or those of the local platform."""
+    """Return the log files that the command names, itself or by a folder, else those of the local platform.
+
+    Raises:
+        UsageError: A file does not exist, or the folder holds no audit log.
+    """
     named = request.files
     for path in named:
         if not path.exists():
@@ -115,7 +120,7 @@ def _json_line(who: str, entry: Entry) -> str:
 def _line(who: str, entry: Entry) -> str:
     try:
         when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%SZ")
-    except (OverflowError, ValueError, OSError):  # somebody changed the file
+    except (OverflowError, ValueError, OSError):  # no time that a server writes: the file was changed
         when = f"time={entry.time!r}"
     actor = [] if entry.actor == who else [f"by {_word(entry.actor)}"]
     subject = [_word(entry.subject)] if entry.subject else []
@@ -124,6 +129,7 @@ def _line(who: str, entry: Entry) -> str:
 
 
 def _word(value: object) -> str:
+    """Return *value* as one word of a line: in JSON quotes if it has spaces or unprintable characters."""
     text = str(value)
     return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
 

@@ -1,4 +1,4 @@
-"""The action enrol --out of the verb robot: one file with address, authority and key of a robot."""
+"""Make the file of rse-pf robot enrol --out, which holds address, authority and key for one robot."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ from rse_pf.local.state import read_state
 
 __all__ = ["EnrolRequest", "enrolment_lines", "make_enrolment"]
 
+# Random bytes from which a robot's private key (Ed25519) is made.
 _SEED_BYTES = 32
+# Bytes that are read of the certificate of an authority; a longer file is cut.
 _MAX_BYTES = 65536
 
 
 @dataclass(frozen=True, kw_only=True)
 class EnrolRequest(RobotRequest):
-    """A robot that is enrolled, with a new key or with its own, and what it may do."""
+    """The options of rse-pf robot enrol: the robot, its key, its scopes and its quota."""
 
     out: Path | None = option(
         "--out", metavar="FILE", help="make a key, and write all that the robot needs to connect to FILE"
@@ -60,10 +62,11 @@ class EnrolRequest(RobotRequest):
 
 
 def make_enrolment(request: EnrolRequest, tenant: str, settings: PlatformSettings) -> Enrolment:
-    """Return an enrolment with a new key, for the platform of the request.
+    """Return the content of an enrolment file for the robot of *request*, with a new private key.
 
     Raises:
-        UsageError: The address is not known, or the file of the authority cannot be read.
+        UsageError: The address of the platform is not known or not valid, or the file of the authority cannot
+            be read or holds no certificate.
     """
     url, authority = _place(request)
     auth = settings.auth
@@ -79,7 +82,7 @@ def make_enrolment(request: EnrolRequest, tenant: str, settings: PlatformSetting
 
 
 def enrolment_lines(made: Enrolment, file: Path) -> list[str]:
-    """Return what the operator has to know about the file."""
+    """Return the lines that are printed after the enrolment *made* was written to *file*."""
     lines = [
         f"wrote {file}: carry it to the robot; it holds the robot's private key, so nobody else may read it",
         f"the robot connects with  client_sdk.connect(enrolment={str(file.name)!r})  to {made.url}",
@@ -100,7 +103,7 @@ def enrolment_lines(made: Enrolment, file: Path) -> list[str]:
 
 
 def _place(request: EnrolRequest) -> tuple[str, Path | None]:
-    """Return the address, and the file of the authority if there is one."""
+    """Return the address that the robot connects to, and the file of the authority, None if there is none."""
     state = None if request.cloud else read_state(request.folder)
     url, authority = request.url or (state.url if state is not None else ""), request.authority
     if not url:
@@ -122,6 +125,7 @@ def _place(request: EnrolRequest) -> tuple[str, Path | None]:
 
 
 def _certificate(path: Path) -> str:
+    """Return the certificate in the PEM file *path*; raises UsageError if it has none, or a private key."""
     try:
         with path.open("rb") as file:
             text = file.read(_MAX_BYTES).decode("ascii")

@@ -102,7 +102,7 @@ def keygen(request: _KeygenRequest, settings: PlatformSettings) -> None:
 
 
 def _enrolled_tenant(request: RobotRequest, access: AccessControlStore) -> str:
-    """Return the tenant of an enrolled robot; raises UsageError if there is no such robot."""
+    """Return the tenant of the enrolled robot of *request*; raises UsageError if there is no such robot."""
     return choose_robot(
         request.robot,
         request.tenant,
@@ -113,7 +113,13 @@ def _enrolled_tenant(request: RobotRequest, access: AccessControlStore) -> str:
 
 
 def _tenant(request: _DisableRequest | AdoptRequest, access: AccessControlStore) -> str:
-    """Return the tenant of a robot, enrolled or not; raises UsageError if there is no such robot."""
+    """Return the tenant of the robot of *request*.
+
+    With --not-enrolled it is the named or the default tenant, and the robot is not looked up.
+
+    Raises:
+        UsageError: Without --not-enrolled, no such robot is enrolled; or a name is not valid.
+    """
     if request.not_enrolled:
         check_robot(request.robot)
         return tenant_or_default(request.tenant)
@@ -122,7 +128,10 @@ def _tenant(request: _DisableRequest | AdoptRequest, access: AccessControlStore)
 
 
 def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
-    """Enrol a robot with its own key, or with a new one that is written to a file."""
+    """Enrol a robot with --public-key, the key that it made, or --out, a new key in a file for the robot.
+
+    A robot of the same tenant and name is replaced, and its key refused within 2 s.
+    """
     if (request.public_key is None) == (request.out is None):
         raise UsageError(
             "enrol needs either --out or --public-key",
@@ -152,7 +161,7 @@ def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
     try:
         access.change_roster(lambda roster: roster.enrolled(robot))
     except BaseException:
-        if request.out is not None:  # a file whose key no platform knows
+        if request.out is not None:  # the platform does not know the key in this file
             request.out.unlink(missing_ok=True)
         raise
     allowed = " ".join(robot.scopes) or "everything"
@@ -169,7 +178,7 @@ def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
 
 
 def adopt(request: AdoptRequest, settings: PlatformSettings) -> None:
-    """Give a robot what is stored under its earlier identity."""
+    """Move what is stored under an earlier identity of a robot to its present one."""
     access = request.open_access_control(settings)
     tenant = _tenant(request, access)
     adopted = run_adopt(request, tenant, settings, access.roster())
@@ -234,6 +243,7 @@ def enable(request: RobotRequest, settings: PlatformSettings) -> None:
 
 
 def _public_key(path: Path) -> str:
+    """Return the public key in the file *path*, or on standard input for ``-``; raises UsageError."""
     try:
         text = sys.stdin.read() if str(path) == "-" else path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -244,7 +254,7 @@ def _public_key(path: Path) -> str:
 
 
 def set_quota(request: _QuotaRequest, settings: PlatformSettings) -> None:
-    """Set what a robot may store."""
+    """Set the bytes that an enrolled robot may store."""
     access = request.open_access_control(settings)
     tenant = _enrolled_tenant(request, access)
     quotas = read_quotas(request.quota)
@@ -295,6 +305,7 @@ def list_robots(request: _ListRequest, settings: PlatformSettings) -> None:
 
 
 def _row(robot: EnrolledRobot, denied: DenyList) -> dict[str, Any]:
+    """Return the row of an enrolled robot in the list, with its state by the deny list *denied*."""
     state = "disabled" if denied.is_disabled(robot.tenant, robot.robot) else "enrolled"
     return {
         "tenant": robot.tenant,

@@ -65,7 +65,7 @@ class _QuotaRequest(PlatformRequest):
 
 
 def _open_store(request: PlatformRequest, settings: PlatformSettings) -> tuple[ObjectStore, PlatformSettings]:
-    """Return the store of the platform of the request, and the settings that hold for it."""
+    """Return the object store of the platform of *request*, and the settings with its store and quotas."""
     if request.cloud:
         from rse_pf.aws.account import open_account
 
@@ -77,7 +77,7 @@ def _open_store(request: PlatformRequest, settings: PlatformSettings) -> tuple[O
 
 
 def list_tenants(request: _ListRequest, settings: PlatformSettings) -> None:
-    """Show all tenants, what they store and what they may store."""
+    """Print a row for each tenant: its enrolled robots, the bytes that it stores, and its quota."""
     access = request.open_access_control(settings)
     store, settings = _open_store(request, settings)
     robots = Counter(robot.tenant for robot in access.roster().robots)
@@ -101,14 +101,17 @@ def list_tenants(request: _ListRequest, settings: PlatformSettings) -> None:
 
 
 def _tenants(access: AccessControlStore, store: ObjectStore) -> list[str]:
-    """Return the names of all tenants, sorted; the folder of one that has no robot and no plain name."""
+    """Return the names of all tenants, sorted: those of robots, and those that have stored something.
+
+    A tenant of which only stored objects are left is named by its folder, which may be an encoded name.
+    """
     named = {robot.tenant for robot in access.roster().robots}
     named |= {robot.tenant for robot in access.deny_list().disabled}
     return sorted(named | (tenant_folders(store) - set(map(name_segment, named))))
 
 
 def set_quota(request: _QuotaRequest, settings: PlatformSettings) -> None:
-    """Set what a tenant may store."""
+    """Set the bytes that a tenant may store, or return it to the quota of the settings."""
     access = request.open_access_control(settings)
     store, settings = _open_store(request, settings)
     tenant, quota = check_tenant(request.tenant), read_quotas(request.quota).get("data_bytes")

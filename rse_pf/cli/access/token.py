@@ -54,10 +54,11 @@ if TYPE_CHECKING:
 
 __all__ = ["ACTION"]
 
+# A claim ``exp`` beyond this Unix time, in seconds, is not shown as seconds left: it is no real time.
 _LAST_TIME = 1e11
+# Random bytes from which a signing key (Ed25519) is made.
 _SEED_BYTES = 32
-
-
+# Default of auth.token_ttl_s, in seconds, for the help page.
 _DEFAULT_TTL_S = PlatformSettings().auth.token_ttl_s
 
 
@@ -111,7 +112,7 @@ class _RetireRequest(PlatformRequest):
 
 
 def issue(request: _IssueRequest, settings: PlatformSettings) -> None:
-    """Print a new token of a robot, which need not exist."""
+    """Print a new token for a robot, which need not be enrolled."""
     if request.cloud and request.key is not None:
         raise UsageError("--cloud and --key name two keys", hint="leave one of them out")
     if request.settings is None and request.key is None and not request.cloud:
@@ -150,6 +151,7 @@ def revoke(request: _RevokeRequest, settings: PlatformSettings) -> None:
 
 
 def _revoke_all(request: _RevokeRequest, name: str, settings: PlatformSettings) -> None:
+    """Refuse every token that was issued to robot *name* until now."""
     access, now, longest = request.open_access_control(settings), time.time(), max_token_s(settings)
     robot, from_s = check_robot(name), float(int(now) + 1)  # tokens have whole seconds, rounded down
     tenant = tenant_or_default(request.tenant)
@@ -172,6 +174,7 @@ def _revoke_all(request: _RevokeRequest, name: str, settings: PlatformSettings) 
 
 
 def _revoke_token(request: _RevokeRequest, token: str, settings: PlatformSettings) -> None:
+    """Refuse one token; raises UsageError if no server of the platform accepts it anyway."""
     now, longest = time.time(), max_token_s(settings)
     header, claims = unverified_parts(_token(token))
     name, token_id, over = claims.get("sub"), claims.get("jti"), claims.get("exp")
@@ -188,7 +191,7 @@ def _revoke_token(request: _RevokeRequest, token: str, settings: PlatformSetting
             f"no server of this platform accepts this token: the key {key_id[:80]!r} is not known",
             hint="if another platform issued it, name that one with --name or --cloud",
         )
-    enrolled = keys.robot_of(key_id)  # the roster says whose a token is that a robot signed
+    enrolled = keys.robot_of(key_id)  # a token that a robot signed is of the tenant that the roster names
     tenant = str(claims.get("tenant", DEFAULT_TENANT)) if enrolled is None else enrolled.tenant
     until_s = min(float(over), now + longest)
     access.change_deny_list(
@@ -202,6 +205,7 @@ def _revoke_token(request: _RevokeRequest, token: str, settings: PlatformSetting
 
 
 def _signing_key(request: _IssueRequest, settings: PlatformSettings, now: float) -> SigningKey:
+    """Return the signing key of the deployment with --cloud, else of --key, else of the local platform."""
     from rse_pf.local.firewall import key_file, read_key
 
     if request.cloud:
@@ -222,13 +226,13 @@ def _new_key() -> SigningKey:
 
 
 def init(request: PlatformRequest, settings: PlatformSettings) -> None:
-    """Create the first key of a cloud, or publish the public half of the key that exists again."""
+    """Create the first signing key of a cloud; if there is one, publish its public half again."""
     from rse_pf.aws.storage.key_store import KeyRing, spread_s
 
     _require_cloud(request, "init")
     store, now = _key_store(settings), time.time()
     existing = store.read()
-    if existing is not None:  # it may never have been published
+    if existing is not None:  # an interrupted init may have stored the key without publishing its public half
         store.publish(existing)
         show(f"key {existing.signer(now).key_id} exists already; its public half is published again")
         return
@@ -238,7 +242,7 @@ def init(request: PlatformRequest, settings: PlatformSettings) -> None:
 
 
 def rotate(request: PlatformRequest, settings: PlatformSettings) -> None:
-    """Create a further key of a cloud, which signs as soon as every server knows it."""
+    """Create a further key of a cloud, which signs tokens as soon as every server has read it."""
     from rse_pf.aws.storage.key_store import spread_s
 
     _require_cloud(request, "rotate")
@@ -248,7 +252,7 @@ def rotate(request: PlatformRequest, settings: PlatformSettings) -> None:
 
 
 def retire(request: _RetireRequest, settings: PlatformSettings) -> None:
-    """Remove the previous key of a cloud."""
+    """Remove the previous signing key of a cloud, so that servers refuse its tokens."""
     from rse_pf.aws.storage.key_store import spread_s
 
     _require_cloud(request, "retire")
@@ -259,7 +263,10 @@ def retire(request: _RetireRequest, settings: PlatformSettings) -> None:
 
 
 def rotate_keys(request: PlatformRequest, settings: PlatformSettings) -> None:
-    """Create a new key that signs from now on; tokens of the previous one stay valid until they expire."""
+    """Create a new signing key of a platform; tokens of the previous key stay valid until they expire.
+
+    With --cloud the new key signs only when every server has read it, as with rotate.
+    """
     if request.cloud:
         rotate(request, settings)
     else:
@@ -267,7 +274,7 @@ def rotate_keys(request: PlatformRequest, settings: PlatformSettings) -> None:
 
 
 def _rotate_local(request: PlatformRequest) -> None:
-    """Publish a new key in addition to the one that signs now, then sign with it."""
+    """Publish the public half of a new key next to that of the present key, then sign with the new key."""
     from rse_pf.local.firewall import key_file, key_set_file, read_key
 
     folder = request.folder
@@ -307,16 +314,25 @@ def inspect(request: _InspectRequest, settings: PlatformSettings) -> int:
 
 
 def _token(subject: str) -> str:
+    """Return the token *subject*, or for ``-`` the first line of standard input."""
     return sys.stdin.readline().strip() if subject == "-" else str(subject).strip()
 
 
 def _seconds_left(claims: dict[str, Any], now: float) -> int | None:
+    """Return the seconds until the token expires, negative if it has expired.
+
+    None if its claim ``exp`` is no number or no real time.
+    """
     over = claims.get("exp")
     is_time = isinstance(over, (int, float)) and not isinstance(over, bool) and abs(over) < _LAST_TIME
     return round(over - now) if is_time and over is not None else None
 
 
 def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> tuple[str, int]:
+    """Return whether *token* is valid, as words, and the exit code: 1 if it is not valid, else 0.
+
+    If *keys* is None, validity is unknown, and the exit code is 0.
+    """
     from rse_pf.auth.tokens import token_problem, verify_token
 
     if keys is None:
@@ -329,7 +345,14 @@ def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> t
 
 
 def _keys(request: _KeysRequest, settings: PlatformSettings) -> Any:
-    """Return the named or the platform's public keys with roster and deny list; None if there are none."""
+    """Return the public keys of --keys, else of the platform, with its roster and deny list.
+
+    None if --keys is not given and the local platform has no public keys.
+
+    Raises:
+        UsageError: The file of --keys does not exist.
+        ConfigurationError: The file cannot be read.
+    """
     from rse_pf.local.firewall import key_set_file
     from rse_pf.storage.object_store import DirectoryStore
 

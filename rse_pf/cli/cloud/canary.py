@@ -14,11 +14,16 @@ from rse_pf.terminal import show
 
 __all__ = ["ACTION"]
 
+# Random bytes from which the private key (Ed25519) of the canary's robot is made.
 _SEED_BYTES = 32
 
 
 def renew_canary_key(request: NoOptions, settings: PlatformSettings) -> int:
-    """Write the private key into the canary's secret and the public one into the roster; return 0."""
+    """Make a key, write it into the canary's secret and its public half into the roster, and return 0.
+
+    The canary is a function on AWS that requests one known pose every minute, like a robot; without a key its
+    alarm fires.
+    """
     from rse_pf.auth.roster import SYNTHETIC, EnrolledRobot
     from rse_pf.auth.tokens import SigningKey
     from rse_pf.aws.account import open_account

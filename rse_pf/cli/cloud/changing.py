@@ -1,4 +1,4 @@
-"""What up, park, resume and down share: they show the steps and the price, ask, carry out, and report."""
+"""Functions of the actions up, park, resume and down: show steps and costs, ask to confirm, carry out."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class ChangeRequest:
-    """A change of the deployment, and whether it needs no confirmation."""
+    """The options of an action that changes the deployment."""
 
     settings: Path | None = None
     yes: bool = option("--yes", help="do not ask for a confirmation")
 
 
 class DeploymentCosts:
-    """What a deployment costs while no robot drives: running, parked, and deeply parked."""
+    """The costs of a deployment without robots: running, parked, and deeply parked (``deep``)."""
 
     def __init__(self, settings: PlatformSettings, prices: Prices) -> None:
         self.prices = prices
@@ -48,44 +48,52 @@ class DeploymentCosts:
         self.parked, self.deep = (parked(self.running, deep=deep) for deep in (False, True))
 
     def line(self, bill: Bill) -> str:
-        """Return the price of *bill* an hour and a month."""
+        """Return the total of *bill* as words: its price an hour and a month."""
         money = self.prices.currency
         return f"{bill.total / HOURS:.2f} {money} an hour, {bill.total:.0f} {money} a month"
 
     def server_per_hour(self, settings: PlatformSettings) -> float:
-        """Return the price of one more server."""
+        """Return the price of one more backend server for an hour, in the currency of the prices."""
         return self.prices.server(settings.cloud.instance_type).per_hour
 
     def warnings(self, settings: PlatformSettings) -> list[str]:
-        """Return what is wrong with the prices."""
+        """Return the warnings about the prices, for example that they are old or of another region."""
         today = datetime.now(timezone.utc).date()
         return self.prices.warnings(today=today, region=settings.cloud.region)
 
 
 def deployment_costs(settings: PlatformSettings) -> DeploymentCosts:
-    """Return the costs by the operator's prices; raises ConfigurationError for an unknown EC2 type."""
+    """Return the costs of the deployment of *settings*, by the operator's prices in the working folder.
+
+    Raises:
+        ConfigurationError: The prices lack the type of the EC2 instances.
+    """
     return DeploymentCosts(settings, operators_prices(None, Path.cwd()))
 
 
 def make_tools(account: Account, settings: PlatformSettings, request: ChangeRequest) -> CdkTools:
-    """Return the tools of the checkout in the working folder; tests put others in their place."""
+    """Return the tools that deploy with the CDK from the working folder, a checkout; tests replace them."""
     caller = account.find("sts", "get_caller_identity") or {}
     return CdkTools(Path.cwd(), settings, str(caller.get("Account", "")), request.settings)
 
 
 def open_world(account: Account, settings: PlatformSettings, tools: CdkTools) -> StepContext:
-    """Return what steps act on."""
+    """Return the context of steps: account, settings, tools, and the output of their progress."""
     return StepContext(account=account, settings=settings, tools=tools, tell=lambda text: show(f"  {text}"))
 
 
 def show_steps(steps: Sequence[Step]) -> None:
-    """Show what will be done."""
+    """Print *steps* as a numbered list."""
     show("this will:")
     show(*(f"  {at}. {step}" for at, step in enumerate(steps, 1)))
 
 
 def confirmed(request: ChangeRequest, question: str = "go on?") -> bool:
-    """Return whether the operator agrees; raises UsageError where nobody can be asked."""
+    """Return whether the operator confirms the change, with --yes or by an answer to *question*.
+
+    Raises:
+        UsageError: Standard input is no terminal, so nobody can be asked.
+    """
     if request.yes:
         return True
     if not sys.stdin.isatty():
@@ -95,6 +103,6 @@ def confirmed(request: ChangeRequest, question: str = "go on?") -> bool:
 
 
 def perform(steps: Sequence[Step], world: StepContext) -> None:
-    """Carry out *steps*, and show each."""
+    """Carry out *steps* one after the other, and print each."""
     show("doing:")
     carry_out(steps, world)

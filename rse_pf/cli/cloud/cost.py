@@ -16,14 +16,17 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
 
+# Largest value of --robots; larger ones are typing errors.
 _MAX_ROBOTS = 1_000_000
+# Largest value of --fps, in frames per second of a robot; larger ones are typing errors.
 _MAX_FPS = 1000
+# Largest value of --burst, in commands a day; larger ones are typing errors.
 _MAX_BURST = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
 class CostRequest:
-    """A load, and the prices by which it is charged."""
+    """The options of rse-pf cloud cost: a load, and the prices by which it is charged."""
 
     robots: int = option("--robots", default=10, metavar="N", help="number of robots (default: %(default)s)")
     fps: float = option(
@@ -44,7 +47,7 @@ class CostRequest:
 
 
 def show_costs(request: CostRequest, settings: PlatformSettings) -> int:
-    """Print the bill and what other ways to run the platform would cost, and return 0."""
+    """Print the monthly bill of a load, and the costs of other ways to run the platform; return 0."""
     from rse_pf.extensions.costs.bill import NOT_INCLUDED, bill_of
     from rse_pf.extensions.costs.prices import operators_prices
 
@@ -67,7 +70,7 @@ def show_costs(request: CostRequest, settings: PlatformSettings) -> int:
 
 
 def _load(request: CostRequest) -> Load:
-    """Return the load that the options describe; raises UsageError."""
+    """Return the load that the options describe; raises UsageError for a value out of bounds."""
     if not 1 <= request.robots <= _MAX_ROBOTS:
         raise UsageError(
             f"--robots {request.robots} is not within 1..{_MAX_ROBOTS}", hint="name how many robots there are"
@@ -94,6 +97,7 @@ def _load(request: CostRequest) -> Load:
 
 
 def _show_bill(bill: Bill, prices: Prices) -> None:
+    """Print the lines of *bill* by box of Fig. 2, with the sum of each box and the total."""
     show(
         f"{'box of Fig. 2':<17}{'what':<47}{'units':>10} {'':<8}{'each':>10}{prices.currency + '/month':>11}"
     )
@@ -109,7 +113,7 @@ def _show_bill(bill: Bill, prices: Prices) -> None:
 
 
 def _show_alternatives(bill: Bill, settings: PlatformSettings, prices: Prices, load: Load) -> None:
-    """Show what other ways to run the platform cost, and whether the settings allow this load."""
+    """Print what other ways to run the platform cost, and whether the settings allow this load."""
     from rse_pf.extensions.costs.bill import (
         DAY_H,
         bill_of,

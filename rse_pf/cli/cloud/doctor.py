@@ -22,16 +22,21 @@ from rse_pf.errors import RsePfError
 __all__ = ["ACTION", "NO_PACKAGES", "check_tools"]
 
 NO_PACKAGES = "no packages"
-"""What a finding says for which `rse-pf cloud up` has a step."""
+"""Beginning of the finding that packages are not built; `rse-pf cloud up` ignores it and builds them."""
+# Oldest major version of Node with which the CDK works.
 _OLDEST_NODE = 22
-_NODE_ANSWERS_S = 10.0
+# Time limit of ``node --version``, in seconds.
+_NODE_TIMEOUT_S = 10.0
+# File of the installed command line of the CDK, in the checkout.
 _CLI = Path("node_modules", "aws-cdk", "package.json")
+# File of the checkout that pins the version of that command line.
 _PINNED = Path("package.json")
+# npm package whose version is that of the assembly (the CDK's output) that the command line can read.
 _SCHEMA = "@aws-cdk/cloud-assembly-schema"
 
 
 def check_deployment(request: NoOptions, settings: PlatformSettings) -> int:
-    """Print one line for each finding; return 1 if one has to be fixed first."""
+    """Check tools and account and print each result; return 1 if any failed, else 0."""
     findings = itertools.chain(check_tools(Path.cwd()), _account_findings(settings))
     return report(findings, "ready: rse-pf cloud up")
 
@@ -48,7 +53,10 @@ def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def check_tools(checkout: Path) -> Iterator[Finding]:
-    """Yield what a deployment from *checkout* needs on this machine; no account is asked."""
+    """Yield the results of the checks on this machine: Node, the CDK, and the packages in *checkout*.
+
+    Nothing is requested from AWS.
+    """
     yield _node()
     yield _cli(checkout)
     yield (
@@ -66,7 +74,7 @@ def _node() -> Finding:
         return Finding(grade="fail", what="Node is not installed", fix=fix)
     try:
         completed = subprocess.run(
-            [program, "--version"], capture_output=True, text=True, timeout=_NODE_ANSWERS_S, check=True
+            [program, "--version"], capture_output=True, text=True, timeout=_NODE_TIMEOUT_S, check=True
         ).stdout.strip()
     except (OSError, subprocess.SubprocessError) as error:
         return Finding(grade="fail", what=f"Node does not run: {error}", fix=fix)
@@ -77,7 +85,10 @@ def _node() -> Finding:
 
 
 def _cli(checkout: Path) -> Finding:
-    """Compare the assembly that the library writes with the newest that the command line reads."""
+    """Return whether the CDK's command line can read the assembly schema that the CDK's library writes.
+
+    A warning if it can, but is not the version that package.json pins.
+    """
     fix = "make setup installs the one in package-lock.json; never npm install aws-cdk"
     try:
         writes = metadata.version("aws-cdk.cloud-assembly-schema")

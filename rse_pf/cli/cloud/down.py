@@ -18,14 +18,15 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
 
+# Longest wait until the tagging service of AWS no longer lists resources that were deleted, in seconds.
 _LISTED_LATE_S = 60.0
-"""The tagging service of AWS may still list for this long what is gone."""
+# Time between two readings of that list, in seconds.
 _POLL_S = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class DownRequest(changing.ChangeRequest):
-    """Whether the data of the deployment is deleted, too."""
+    """The options of rse-pf cloud down: whether the data is deleted, too, and its confirmation."""
 
     delete_data: bool = option(
         "--delete-data",
@@ -37,7 +38,10 @@ class DownRequest(changing.ChangeRequest):
 
 
 def take_down(request: DownRequest, settings: PlatformSettings) -> int:
-    """Take the platform down; return 1 if something is left that nobody keeps, or the answer is no."""
+    """Destroy the deployment, and print which of its resources are left over or kept on purpose.
+
+    Returns 1 if any is left over, or if the operator does not confirm, else 0.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.lifecycle.deployment import read_deployment
     from rse_pf.aws.lifecycle.plan import plan_down
@@ -61,7 +65,11 @@ def take_down(request: DownRequest, settings: PlatformSettings) -> int:
 
 
 def _confirmed_twice(request: DownRequest, names: ResourceNames) -> bool:
-    """Return whether the operator names the deployment whose data is to be deleted."""
+    """Return whether the operator typed the name of the deployment whose data is to be deleted.
+
+    Raises:
+        UsageError: --confirm has another name, or it is not given and nobody can be asked.
+    """
     if request.confirm:
         if request.confirm != names.prefix:
             raise UsageError(
@@ -79,6 +87,7 @@ def _confirmed_twice(request: DownRequest, names: ResourceNames) -> bool:
 
 
 def _prove(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
+    """Return which resources of the deployment exist now: kept on purpose, with their costs, or left over."""
     return prove(
         account, names, gb_month_price=costs.prices.stored_per_gb_month,
         secret_month_price=costs.prices.secret_per_month, now=datetime.now(timezone.utc),
@@ -86,7 +95,7 @@ def _prove(account: Account, names: ResourceNames, costs: changing.DeploymentCos
 
 
 def _last_proof(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
-    """Return the proof, when AWS lists nothing any more that nobody keeps, or after a minute."""
+    """Return the resources that exist once AWS lists none as left over, or after `_LISTED_LATE_S`."""
     deadline = time.monotonic() + _LISTED_LATE_S
     while True:
         proof = _prove(account, names, costs)
@@ -96,6 +105,10 @@ def _last_proof(account: Account, names: ResourceNames, costs: changing.Deployme
 
 
 def _show_kept(proof: Proof, *, is_over: bool) -> None:
+    """Print the resources that are kept on purpose, with size and monthly cost.
+
+    *is_over* is whether the deployment is destroyed already; it only changes the words.
+    """
     for resource in proof.kept:
         size = (
             ""

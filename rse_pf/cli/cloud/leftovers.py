@@ -10,11 +10,15 @@ from rse_pf.terminal import show, show_error
 
 __all__ = ["ACTION"]
 
+# Exit code if AWS could not be asked; 1 means that there are leftovers.
 _FAILED = 2
 
 
 def show_leftovers(request: NoOptions, settings: PlatformSettings) -> int:
-    """Print what is left over; return 1 if anything is, 2 if AWS could not be asked."""
+    """Print each resource that belongs to no stack, and how to remove it.
+
+    Returns 1 if there is any, 2 if AWS could not be asked, else 0.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.cloudformation import list_living_stacks
     from rse_pf.aws.lifecycle.leftovers import find_leftovers
@@ -22,7 +26,7 @@ def show_leftovers(request: NoOptions, settings: PlatformSettings) -> int:
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
     try:
         stacks, leftovers = list_living_stacks(account, names), find_leftovers(account, names)
-    except StoreError as error:  # its exit code is that of a finding
+    except StoreError as error:  # `main` would exit with 1, which means leftovers here
         show_error(error)
         return _FAILED
     if stacks:

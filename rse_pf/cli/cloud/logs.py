@@ -13,12 +13,13 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
 
+# Largest value of --lines.
 _MAX_LINES = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogsRequest:
-    """The server whose log is shown, and how much of it."""
+    """The options of rse-pf cloud logs: the server whose log is shown, and how many lines of it."""
 
     server: str | None = option(
         nargs="?", metavar="SERVER", help="instance id; without it the servers with journals are listed"
@@ -28,7 +29,10 @@ class LogsRequest:
 
 
 def show_logs(request: LogsRequest, settings: PlatformSettings) -> int:
-    """Print lines, or the servers that have some; return 1 if there are none."""
+    """Print the newest lines of a server's log or console; without a server, the servers that have logs.
+
+    Returns 1 if there are none, else 0.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.server_logs import console_of, last_lines, list_logged_servers, open_journals
 
@@ -50,7 +54,7 @@ def show_logs(request: LogsRequest, settings: PlatformSettings) -> int:
                 show("no server has sent its journals; they come every minute")
             return 0 if servers else 1
         matching = [server for server in servers if server.name == request.server]
-        # A boot that failed early shipped nothing, and its console is all that there is.
+        # A server whose boot failed early has sent no journal: its console is shown in place of it.
         lines = (
             last_lines(store, matching[0], request.lines) if matching else console_of(account, request.server)
         )

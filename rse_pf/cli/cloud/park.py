@@ -14,7 +14,7 @@ __all__ = ["ACTION"]
 
 @dataclass(frozen=True, kw_only=True)
 class ParkRequest(changing.ChangeRequest):
-    """How much of the deployment is parked."""
+    """The options of rse-pf cloud park."""
 
     deep: bool = option(
         "--deep",
@@ -23,7 +23,10 @@ class ParkRequest(changing.ChangeRequest):
 
 
 def park(request: ParkRequest, settings: PlatformSettings) -> int:
-    """Park the platform; return 1 if the operator does not agree."""
+    """Terminate all servers until resume, with --deep also balancer, endpoints and Lambda; return 0.
+
+    Returns 1 if the operator does not confirm.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.lifecycle.deployment import read_deployment
     from rse_pf.aws.lifecycle.plan import plan_park

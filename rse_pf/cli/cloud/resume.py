@@ -11,7 +11,10 @@ __all__ = ["ACTION"]
 
 
 def resume(request: changing.ChangeRequest, settings: PlatformSettings) -> int:
-    """Resume the platform; return 1 if something has to be fixed first, or the operator does not agree."""
+    """End the parking of the platform, and print its address; return 0.
+
+    Returns 1 if a check fails, which has to be fixed first, or if the operator does not confirm.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.lifecycle.deployment import read_deployment
     from rse_pf.aws.lifecycle.plan import plan_resume

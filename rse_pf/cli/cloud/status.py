@@ -16,7 +16,10 @@ __all__ = ["ACTION"]
 
 
 def show_status(request: NoOptions, settings: PlatformSettings) -> int:
-    """Print the state of the deployment; return 1 if it is not healthy."""
+    """Print stage, costs, servers, robots and alarms of the deployment.
+
+    Returns 1 if the fleet is not healthy; 0 if it is, or if there is none: absent or deeply parked.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.group import read_group
     from rse_pf.aws.lifecycle.deployment import read_deployment
@@ -52,7 +55,7 @@ def show_status(request: NoOptions, settings: PlatformSettings) -> int:
 
 
 def _show_stage(deployment: Deployment, settings: PlatformSettings) -> None:
-    """Show in one line what stands, and in one what that costs without robots."""
+    """Print the stage of the deployment, its costs an hour without robots, and its address if it has one."""
     costs, note = changing.deployment_costs(settings), deployment.note
     name = ResourceNames(settings.cloud.name).prefix
     parked_by = f", by the {note.by} since {note.since}: rse-pf cloud resume" if note is not None else ""

@@ -18,7 +18,10 @@ __all__ = ["ACTION", "finish", "show_failed_checks"]
 
 
 def bring_up(request: changing.ChangeRequest, settings: PlatformSettings) -> int:
-    """Put the platform up; return 1 if something has to be fixed first, or the operator does not agree."""
+    """Deploy the platform, update it, or finish a deployment that was interrupted; return 0.
+
+    Returns 1 if a check fails, which has to be fixed first, or if the operator does not confirm.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.lifecycle.deployment import read_deployment
     from rse_pf.aws.lifecycle.plan import plan_up
@@ -39,7 +42,7 @@ def bring_up(request: changing.ChangeRequest, settings: PlatformSettings) -> int
 
 
 def show_failed_checks(account: Account, settings: PlatformSettings) -> bool:
-    """Show what has to be fixed before a deployment; return whether there is anything."""
+    """Print the checks that failed and must be fixed before a deployment; return whether there is any."""
     failed = [finding for finding in _findings(account, settings) if finding.grade == "fail"]
     for finding in failed:
         show(*finding.lines())
@@ -47,7 +50,7 @@ def show_failed_checks(account: Account, settings: PlatformSettings) -> bool:
 
 
 def finish(account: Account, settings: PlatformSettings) -> int:
-    """Show the address and the next commands; return 0."""
+    """Print the address of the deployment, and the commands that usually follow; return 0."""
     from rse_pf.aws.fleet.upgrade import versions_behind
     from rse_pf.aws.lifecycle.deployment import read_deployment
 
@@ -68,7 +71,7 @@ def finish(account: Account, settings: PlatformSettings) -> int:
 
 
 def _findings(account: Account, settings: PlatformSettings) -> Iterator[Finding]:
-    """Yield what the doctor finds, but for what `up` has a step for."""
+    """Yield the results of rse-pf cloud doctor, except for those that a step of `bring_up` repairs."""
     from rse_pf.aws.lifecycle.account_checks import NOT_BOOTSTRAPPED, check_account
 
     for finding in check_tools(Path.cwd()):

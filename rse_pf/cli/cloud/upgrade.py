@@ -13,7 +13,11 @@ __all__ = ["ACTION"]
 
 
 def upgrade_servers(request: NoOptions, settings: PlatformSettings) -> int:
-    """Follow the replacement of the servers; return 1 if it was taken back or failed."""
+    """Replace the servers by those of the newest deployment, and print the progress until the end.
+
+    Returns 0 if all servers run the new version; 1 if the old servers came back, it failed, or on Ctrl-C,
+    after which AWS continues.
+    """
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.upgrade import upgrade
 

@@ -1,4 +1,4 @@
-"""The verbs local and fleet: start a platform on this machine, show it and change it while it runs.
+"""The verb local: start a platform on this machine, show its state, and change it while it runs.
 
-What a person reads and types belongs here; what it does is in `rse_pf.local`.
+Options and printed text belong here; the work is in `rse_pf.local`.
 """

@@ -1,4 +1,4 @@
-"""What rse-pf local --lan prints: addresses, authority, enrolment and firewall."""
+"""Choose the address of rse-pf local --lan, and make the lines that it prints for other machines."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ __all__ = ["chosen_address", "lan_lines"]
 
 
 def chosen_address(text: str | None) -> str:
-    """Return the address that --lan means: "" without it, a detected one if it names none.
+    """Return the address to listen on for other machines; "" if --lan is not given.
+
+    Args:
+        text: Value of --lan; "" detects the address of this machine in its network, None means no --lan.
 
     Raises:
-        UsageError: *text* is no address that others can connect to.
-        ConfigurationError: None could be detected.
+        UsageError: *text* is no address to which other machines can connect.
+        ConfigurationError: No address could be detected.
     """
     if text is None:
         return ""
@@ -24,7 +27,14 @@ def chosen_address(text: str | None) -> str:
 
 
 def lan_lines(url: str, authority: CertificateWithKey, file: Path, which: str) -> list[str]:
-    """Return what to do so that a robot or a browser of another machine connects to *url*."""
+    """Return the lines that say how a robot or a browser of another machine connects to *url*.
+
+    Args:
+        url: Address that robots connect to.
+        authority: The platform's certificate authority, which they must trust.
+        file: File of the authority's certificate.
+        which: Option, after a space, that names the platform in commands; "" for the default one.
+    """
     port = urlsplit(url).port
     return [
         f"enrol a robot       rse-pf robot enrol robot-1 --out robot-1.enrolment{which}",

@@ -63,21 +63,25 @@ if TYPE_CHECKING:
 
 __all__ = ["ACTION", "DEFAULT_NAME", "PlatformRequest"]
 
+# Name of the platform if --name is not given.
 DEFAULT_NAME = "default"
 # Port on loopback of the burst function if --burst is given without a port.
 _BURST_PORT = 8702
+# Number of the newest lines that logs and events print without --since.
 _LINES = 100
+# Time between two readings of the logs with --follow, in seconds.
 _FOLLOW_S = 0.2
+# Time over which status measures CPU load and requests/s, in seconds.
 _SAMPLE_S = 0.5
+# Signals that end a fault, --follow, or the platform.
 _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
+# Defaults of the settings group local, for the help page.
 _DEFAULTS = PlatformSettings().local
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlatformRequest:
-    """A platform on this machine."""
+    """The option that names a platform on this machine."""
 
     name: str = option(
         "--name", default=DEFAULT_NAME, help=f"name of the platform, if several run (default: {DEFAULT_NAME})"
@@ -91,7 +95,7 @@ class PlatformRequest:
         return state_folder(self.name, os.environ)
 
     def read_state(self) -> PlatformState:
-        """Return the state of the platform; raises UsageError if it does not run."""
+        """Return the content of the platform's state file; raises UsageError if it does not run."""
         from rse_pf.local.state import read_state
 
         state = read_state(self.folder)
@@ -202,7 +206,11 @@ class _FaultRequest(_ServerRequest):
             raise UsageError("--for takes a positive number of seconds", hint="leave it out")
 
     def waiter(self) -> Callable[[float], bool]:
-        """Block the signals that end a fault, and return the function that waits for the end."""
+        """Block the signals that end a fault, and return a function that waits for them or --for.
+
+        The function takes seconds to wait, and returns whether the fault is to end now.  The time of --for
+        begins with this call.
+        """
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
         end_s = math.inf if self.for_s is None else time.monotonic() + self.for_s
         return functools.partial(_wait, end_s)
@@ -216,7 +224,7 @@ class _SlowRequest(_FaultRequest):
 
 
 def start(request: _StartRequest, settings: PlatformSettings) -> int:
-    """Run a platform until a signal or rse-pf local stop."""
+    """Run a platform until a signal or rse-pf local stop; return 0, or 130 if it was not ready before."""
     folder = request.folder
     require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
@@ -242,7 +250,7 @@ def start(request: _StartRequest, settings: PlatformSettings) -> int:
 
 
 def stop(request: PlatformRequest, settings: PlatformSettings) -> None:
-    """Stop a platform that runs."""
+    """Stop all processes of a platform, if it runs."""
     from rse_pf.local.state import stop_platform
 
     stopped = stop_platform(request.folder)
@@ -250,7 +258,12 @@ def stop(request: PlatformRequest, settings: PlatformSettings) -> None:
 
 
 def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSettings:
-    """Return *settings* whose servers announce the burst function to robots, at *port*."""
+    """Return *settings* whose servers name robots the burst function at *port* on loopback.
+
+    Raises:
+        UsageError: *lan* is not empty, or *port* is no port.
+        ConfigurationError: Another program listens on *port*.
+    """
     from rse_pf.config.front_door import BURST_PATH
     from rse_pf.local.firewall import check_listener
 
@@ -267,7 +280,11 @@ def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSett
 def _with_services(
     settings: PlatformSettings, services: str | None, is_weak_accepted: bool
 ) -> PlatformSettings:
-    """Return *settings* with the options for installed services; raises UsageError for a damaged service."""
+    """Return *settings* with the folder *services* of installed services, and weak isolation if accepted.
+
+    Raises:
+        UsageError: A service in the folder is damaged.
+    """
     changes: dict[str, Any] = {"accept_weak_isolation": True} if is_weak_accepted else {}
     if services is not None:
         from rse_pf.services.custom.installed import installed_services
@@ -279,7 +296,7 @@ def _with_services(
 
 
 def show_status(request: _StatusRequest, settings: PlatformSettings) -> None:
-    """Show servers, alarms and load of a platform."""
+    """Print processes, load and disk warnings of a platform that runs, as a table or as JSON."""
     from rse_pf.local.control.status import platform_status, status_table
 
     status = asyncio.run(platform_status(request.read_state(), sample_s=_SAMPLE_S))
@@ -290,24 +307,24 @@ def show_status(request: _StatusRequest, settings: PlatformSettings) -> None:
 
 
 def kill_balancer(request: PlatformRequest, settings: PlatformSettings) -> None:
-    """Kill the load balancer; the control plane starts another one."""
+    """Kill the load balancer of a platform; its control plane starts another one."""
     from rse_pf.extensions.experiments.faults import faults
 
     show(f"killed the load balancer (pid {faults.kill_balancer(request.read_state())})")
 
 
 def kill(request: _ServerRequest, settings: PlatformSettings) -> None:
-    """Kill all processes of a server."""
+    """Send SIGKILL to all processes of a server."""
     _signal(request, signal.SIGKILL, "killed")
 
 
 def resume(request: _ServerRequest, settings: PlatformSettings) -> None:
-    """Continue a server that was paused."""
+    """Send SIGCONT to all processes of a server that was paused."""
     _signal(request, signal.SIGCONT, "continued")
 
 
 def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
-    """Stop all processes of a server, and continue them after a time if one is named."""
+    """Send SIGSTOP to all processes of a server, and with --for continue them after that time or Ctrl-C."""
     from rse_pf.extensions.experiments.faults import faults
 
     state = request.read_state()
@@ -324,7 +341,7 @@ def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 
 def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
-    """Leave a server a part of its CPU time, until a time is over or Ctrl-C."""
+    """Leave a server --percent of its CPU time, until the time of --for is over or Ctrl-C."""
     from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
@@ -335,7 +352,7 @@ def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
 
 
 def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
-    """Cut a server off from the network, until a time is over or Ctrl-C."""
+    """Cut a server off from the network, until the time of --for is over or Ctrl-C."""
     from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
@@ -347,6 +364,7 @@ def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 
 def _signal(request: _ServerRequest, number: signal.Signals, done: str) -> None:
+    """Send signal *number* to all processes of the server, and print *done* with their number."""
     from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
@@ -355,13 +373,14 @@ def _signal(request: _ServerRequest, number: signal.Signals, done: str) -> None:
 
 
 def _health(folder: Path) -> HealthSettings:
+    """Return the health settings of the platform in *folder*, the defaults if it has no settings file."""
     from rse_pf.local.state import platform_settings
 
     return (platform_settings(folder) or PlatformSettings()).health
 
 
 def _check_pause(for_s: float, longest_s: float, server: str) -> None:
-    """Refuse a pause that would never end, because the server is replaced first."""
+    """Raise UsageError if a pause of *for_s* is too long: the server is replaced after *longest_s*."""
     if for_s >= longest_s:
         raise UsageError(
             f"{server} would not go on after {for_s:g} s: a server that is stopped is replaced after "
@@ -371,19 +390,19 @@ def _check_pause(for_s: float, longest_s: float, server: str) -> None:
 
 
 def _describe_outcome(server: Any, done: str) -> str:
-    """Return what became of a server after a fault: *done*, or that it is gone."""
+    """Return the words for the state of a server after a fault: *done*, or that it was replaced."""
     from rse_pf.local.processes import is_alive
 
     return done if is_alive(server.process) else "is gone: it was replaced meanwhile"
 
 
 def show_logs(request: _LogsRequest, settings: PlatformSettings) -> None:
-    """Show the newest lines of the logs of all processes, and new ones with --follow."""
+    """Print the newest lines of the logs of all processes, and with --follow each new line."""
     _show_lines(request, format_line, line_document)
 
 
 def show_events(request: _LogsRequest, settings: PlatformSettings) -> None:
-    """Show what happened to servers, robots and live maps."""
+    """Print the newest events of servers, robots and live maps, and with --follow each new one."""
     _show_lines(request, format_event, event_document)
 
 
@@ -414,7 +433,7 @@ def _show_lines(
 
 
 def show_robots(request: _StatusRequest, settings: PlatformSettings) -> int:
-    """Show the robots that are connected; return 1 if a server did not answer."""
+    """Print the robots that are connected; return 1 if a server did not answer, else 0."""
     from rse_pf.cli.local_platform.robots import connected_robots, robots_table
 
     robots = connected_robots(request.read_state())
@@ -428,19 +447,22 @@ def show_robots(request: _StatusRequest, settings: PlatformSettings) -> int:
 
 
 def drain(request: _ServerRequest, settings: PlatformSettings) -> int:
-    """Move the robots of a server to other servers, and close it."""
+    """Move the robots of a server to other servers, wait until it has exited, and return the exit code."""
     return _operate(request, "drain", {"server": request.server}, f"{request.server} has left")
 
 
 def roll(request: _RollRequest, settings: PlatformSettings) -> int:
-    """Replace all servers without loss, by those of other settings if a file is named."""
+    """Replace all servers one by one, with the settings of --settings if given; return the exit code."""
     file = request.settings
     parameters = {} if file is None else {"settings": str(file.absolute())}
     return _operate(request, "roll", parameters, "every server was replaced")
 
 
 def _operate(request: PlatformRequest, action: str, parameters: dict[str, str], done: str) -> int:
-    """Let the control plane operate, and show its events; Ctrl-C ends only the report."""
+    """Have the control plane carry out *action*, print its events, then *done*, and return 0.
+
+    Ctrl-C ends only the output, with exit code 130: the operation goes on.
+    """
     from rse_pf.cli.local_platform.operations import operate
 
     try:
@@ -453,7 +475,10 @@ def _operate(request: PlatformRequest, action: str, parameters: dict[str, str], 
 
 
 def _wait(end_s: float, seconds: float) -> bool:
-    """Wait *seconds*, but not past *end_s* (monotonic) or a signal; return whether one of these came."""
+    """Wait *seconds*, but not past *end_s* (monotonic) or a signal of `_STOPPERS`, which must be blocked.
+
+    Returns True if *end_s* has passed or a signal came, else False.
+    """
     left_s = min(seconds, max(0.0, end_s - time.monotonic()))
     if math.isinf(left_s):
         signal.sigwait(_STOPPERS)
@@ -462,7 +487,10 @@ def _wait(end_s: float, seconds: float) -> bool:
 
 
 class _Extras(NamedTuple):
-    """Optional processes of a platform: fleet page, burst function (None: none)."""
+    """The optional processes of a platform: ``page`` is whether the fleet page runs.
+
+    ``burst_port`` is the port of the burst function; None if that does not run.
+    """
 
     page: bool
     burst_port: int | None
@@ -471,6 +499,7 @@ class _Extras(NamedTuple):
 async def _foreground(
     name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, extras: _Extras
 ) -> int:  # fmt: skip
+    """Run the platform *name* in *folder* until a signal, then stop it; return the exit code."""
     from rse_pf.extensions.fleet_page.page_process import run_beside_platform, run_page
     from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
     from rse_pf.local.control.control_plane import ControlOptions
@@ -550,7 +579,7 @@ def _show_page(url: str) -> None:
 
 
 def _lan_lines(platform: Any, which: str) -> list[str]:
-    """Return what other machines need; nothing without --lan."""
+    """Return the lines about connections of other machines; none without --lan."""
     from rse_pf.cli.local_platform.lan import lan_lines
 
     if platform.lan is None:
@@ -561,6 +590,7 @@ def _lan_lines(platform: Any, which: str) -> list[str]:
 
 
 def _show(event: Any) -> None:
+    """Print *event* as a sentence with its time, unless it is in `_QUIET` or has no sentence."""
     from rse_pf.extensions.fleet_page.feeds.events import EVENTS, event_sentence
 
     if event["event"] in EVENTS and event["event"] not in _QUIET:

@@ -1,8 +1,8 @@
-"""The actions logs and events: the logs of all processes of a platform in one, by time; also of one that
-has ended.
+"""Read the logs of all processes of a platform as one, by time, for rse-pf local logs and local events.
 
-Servers write JSON, one object a line; other processes write text.  What the control plane did is read from
-its audit log.  A log that was rotated or belongs to a server that started later is followed, too.
+This also works after the platform has stopped.  Servers write JSON, one object a line; other processes write
+text.  The events of the control plane are read from its audit log.  With --follow, logs of servers that start
+later are read, too, and a log that was rotated is read from its new beginning.
 """
 
 from __future__ import annotations
@@ -40,11 +40,15 @@ __all__ = [
     "since_time_s",
 ]
 
+# Levels of a line, lowest first.
 LEVELS = ("debug", "info", "warning", "error")
-# Bytes at the end of each log that are read, unless a time is given from which on lines are wanted.
+# Bytes that are read at the end of each log if --since is not given, and at most in one reading with
+# --follow.
 _TAIL_BYTES = 1 << 20
+# Fields of a JSON line that are shown by themselves, and not as NAME=VALUE.
 _HEAD = ("time", "level", "event", "traceback")
-# Events that backend servers report themselves.
+# Beginnings of the names of events that backend servers report in their logs; all others are the control
+# plane's.
 _OF_SERVERS = ("robot-", "live-")
 _AGE = re.compile(r"(?P<count>\d{1,9}(\.\d{1,9})?)(?P<unit>[smhd])")
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -52,9 +56,10 @@ _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogLine:
-    """One line of the log of ``source``.
+    """One line of the log of process ``source``.
 
-    ``time_s`` is Unix time; ``fields`` is empty for a line of text.
+    ``time_s`` is Unix time; ``text`` is the line for a person; ``fields`` has the fields of a JSON line, and
+    is empty for a line of text.
     """
 
     time_s: float
@@ -66,8 +71,11 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogFilter:
-    """Which lines are wanted: least level, earliest Unix time, robot, tenant, and the process that wrote a
-    line or that it is about; an empty name is any.  An event of a server concerns every tenant.
+    """The lines that are wanted.
+
+    ``level`` is the lowest level, ``since_s`` the earliest Unix time.  ``robot`` and ``tenant`` are those
+    that a line is about; ``process`` is the process that wrote the line, or that it is about.  An empty name
+    means any.  Events of the control plane that name no tenant are wanted for every tenant.
     """
 
     level: str = "debug"
@@ -89,16 +97,17 @@ class LogFilter:
         )
 
 
+# The filter that accepts every line.
 ALL_LINES = LogFilter()
 
 
 def since_time_s(text: str, now_s: float) -> float:
-    """Return the Unix time that *text* means: an age such as 5m, or a date and time.
+    """Return the Unix time that *text* means: an age before *now_s* such as 5m, or a date and time.
 
-    A date without a time zone is in that of this machine.
+    A date without a time zone is in the time zone of this machine.
 
     Raises:
-        UsageError: It is neither.
+        UsageError: *text* is neither an age nor a date.
     """
     age = _AGE.fullmatch(text)
     if age is not None:
@@ -113,7 +122,11 @@ def since_time_s(text: str, now_s: float) -> float:
 
 
 def log_files(folder: Path, server: str | None) -> list[Path]:
-    """Return the logs of *folder*, also those that were rotated; raises UsageError if *server* has none."""
+    """Return all log files in *folder*, also those that were rotated.
+
+    Raises:
+        UsageError: There is no log, or the process *server*, if it is not None, has none.
+    """
     files = [*sorted(folder.glob("*.log.1")), *log_files_of(audit_folder(folder), CONTROL_PLANE)]
     files += [file for file in _all_files(folder) if file not in files]
     if files and (server is None or any(_source(file) == server for file in files)):
@@ -127,7 +140,10 @@ def log_files(folder: Path, server: str | None) -> list[Path]:
 
 
 def last_lines(files: Sequence[Path], wanted: LogFilter, count: int) -> list[LogLine]:
-    """Return the *wanted* lines of all files, oldest first: the newest *count*, or all since a time."""
+    """Return the *wanted* lines of all *files*, oldest first.
+
+    These are the newest *count* lines, or, if *wanted* has an earliest time, all lines since then.
+    """
     is_open = math.isinf(wanted.since_s)
     tail_bytes = _TAIL_BYTES if is_open else None
     lines = [line for file in files for line in _parse(file, _tail(file, tail_bytes), wanted)]
@@ -141,18 +157,18 @@ def local_time(time_s: float) -> str:
 
 
 def format_line(line: LogLine) -> str:
-    """Return *line* for a person, in the local time of this machine."""
+    """Return *line* as it is printed: local time, process, level and text."""
     return f"{local_time(line.time_s)}  {line.source}  {line.level:7}  {line.text}"
 
 
 def line_document(line: LogLine) -> dict[str, Any]:
-    """Return *line* as plain JSON values."""
+    """Return *line* as plain JSON values: its fields or its text, with time, source and level."""
     fields = line.fields or {"text": line.text}
     return {**fields, "time": line.time_s, "source": line.source, "level": line.level}
 
 
 def format_event(line: LogLine) -> str:
-    """Return the event in *line* as a sentence for a person."""
+    """Return the event in *line* as it is printed: local time and a sentence."""
     return f"{local_time(line.time_s)}  {event_sentence(line.fields)}"
 
 
@@ -163,22 +179,22 @@ def event_document(line: LogLine) -> dict[str, Any]:
 
 
 class LogFollower:
-    """Reads what is appended to the logs of a folder from now on."""
+    """Reads the lines that are appended to the logs of a folder after this object was made."""
 
     def __init__(self, folder: Path, wanted: LogFilter = ALL_LINES) -> None:
-        """Begin at the present end of every log."""
+        """Note the present end of every log in *folder*; only lines of *wanted* will be returned."""
         self._folder = folder
         self._wanted = wanted
         self._read = {file: _size(file) for file in self._files()}
         self._rest: dict[Path, bytes] = {}
 
     def new_lines(self) -> list[LogLine]:
-        """Return the lines that were completed since the last call, oldest first."""
+        """Return the wanted lines that were completed since the last call, oldest first."""
         lines = [line for file in self._files() for line in self._of(file)]
         return sorted(lines, key=lambda line: line.time_s)
 
     def follow(self, take: Callable[[LogLine], None], wait: Callable[[], bool]) -> None:
-        """Give every new line to *take*; look again after each *wait* that returns False."""
+        """Call *take* with every new line, after each call of *wait*, until *wait* returns True."""
         while not wait():
             for line in self.new_lines():
                 take(line)
@@ -187,8 +203,9 @@ class LogFollower:
         return _all_files(self._folder)
 
     def _of(self, file: Path) -> list[LogLine]:
+        """Return the wanted lines of *file* after those that were read; an incomplete last line is kept."""
         at, size = self._read.get(file, 0), _size(file)
-        if size < at:  # rotated, or a new process of the same name
+        if size < at:  # the log was rotated, or begun again by a new process of the same name
             at, self._rest[file] = 0, b""
         if size == at:
             return []
@@ -204,17 +221,22 @@ class LogFollower:
 
 
 def _concerns_all(line: LogLine) -> bool:
+    """Return whether *line* is an entry of the control plane that names no tenant."""
     return line.source == CONTROL_PLANE and "tenant" not in line.fields
 
 
 def _is_event(line: LogLine) -> bool:
-    """Return whether *line* is an event; the control plane reports all but those of robots and live maps."""
+    """Return whether *line* is an event that is shown.
+
+    Events of robots and live maps are taken from any log, all others from the control plane's only, since
+    other processes log some of them, too.
+    """
     kind = line.fields.get("event", "")
     return kind in EVENTS and (line.source == CONTROL_PLANE or kind.startswith(_OF_SERVERS))
 
 
 def _all_files(folder: Path) -> list[Path]:
-    """Return the logs of all processes, and the audit log of the control plane."""
+    """Return the present log files of all processes, and that of the control plane's audit log."""
     return [*sorted(folder.glob("*.log")), *audit_folder(folder).glob(f"{CONTROL_PLANE}.jsonl")]
 
 
@@ -224,9 +246,10 @@ def _source(file: Path) -> str:
 
 
 def _parse(file: Path, data: bytes, wanted: LogFilter) -> Iterator[LogLine]:
-    """Yield the *wanted* lines of *data*; a line of text has time and level of the line before it.
+    """Yield the *wanted* lines of *data*, a part of the log *file*.
 
-    Text before the first line with a time has the time at which the file was written last.
+    A line of text gets time and level of the JSON line before it; before the first JSON line, the time at
+    which the file was last written, and the level info.
     """
     time_s, last, source = _written_s(file), "info", _source(file)
     for text in data.decode("utf-8", "replace").splitlines():
@@ -242,7 +265,10 @@ def _parse(file: Path, data: bytes, wanted: LogFilter) -> Iterator[LogLine]:
 
 
 def _entry_document(text: str) -> dict[str, Any] | None:
-    """Return the entry of the control plane's audit log in *text* as a line of a log."""
+    """Return the entry in *text*, a line of the control plane's audit log, with the fields of a log line.
+
+    None if *text* is no entry.
+    """
     entry = parse_entry(text.encode())
     if entry is None:
         return None
@@ -252,6 +278,7 @@ def _entry_document(text: str) -> dict[str, Any] | None:
 
 
 def _document(text: str) -> dict[str, Any] | None:
+    """Return the fields of the JSON line *text*; None if it is no JSON object with time and event."""
     if not text.startswith("{"):
         return None
     try:
@@ -263,6 +290,7 @@ def _document(text: str) -> dict[str, Any] | None:
 
 
 def _body(document: Mapping[str, Any], source: str) -> str:
+    """Return the text of a JSON line: event, fields as NAME=VALUE, and the last line of a traceback."""
     fields = " ".join(
         f"{name}={_word(value)}"
         for name, value in document.items()
@@ -278,7 +306,7 @@ def _word(value: Any) -> str:
 
 
 def _tail(file: Path, most: int | None) -> bytes:
-    """Return the whole lines in the last *most* bytes of *file*; None reads all."""
+    """Return the whole lines in the last *most* bytes of *file* (None: all); b"" if it is missing."""
     try:
         with file.open("rb") as opened:
             start = 0 if most is None else max(0, _size(file) - most)

@@ -1,4 +1,4 @@
-"""The actions drain and roll: ask the control plane, and show what it does until it is done."""
+"""Request an operation, drain or roll, of a platform's control plane, and follow its events to the end."""
 
 from __future__ import annotations
 
@@ -16,19 +16,29 @@ from rse_pf.local.state import PlatformState
 
 __all__ = ["operate"]
 
+# Longest time without an event, in seconds, before the control plane counts as lost: longer than a server
+# takes to start, or to drain.
 _SILENCE_S = 300.0
-"""Longer than a server takes to start, and a drain to end."""
-_OVER, _FAILED = "operation-over", "operation-failed"
+# Name of the last event of an operation that succeeded.
+_OVER = "operation-over"
+# Name of the last event of an operation that failed.
+_FAILED = "operation-failed"
 
 
 def operate(
     state: PlatformState, action: str, take: Callable[[Mapping[str, Any]], None], **parameters: str
 ) -> None:
-    """Let the control plane do *action*, and give every event to *take* until it is done.
+    """Have the control plane carry out *action*, and call *take* with each event until it is done.
+
+    Args:
+        state: The platform's state.
+        action: Name of the operation: ``drain`` or ``roll``.
+        take: Called with each event of the platform meanwhile.
+        parameters: Parameters of the operation, such as ``server``.
 
     Raises:
-        UsageError: The control plane does not run, or refuses.
-        CommandFailed: The operation failed, or the control plane ended meanwhile.
+        UsageError: The control plane does not run, or refuses the operation.
+        CommandFailed: The operation failed, or the control plane exited or did not answer meanwhile.
     """
     if not is_alive(state.control_plane) or not state.status_port:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""The action robots: which robots are connected, to which server, and what their last answer was."""
+"""Read the connected robots from all servers of a platform, and format them for rse-pf local robots."""
 
 from __future__ import annotations
 
@@ -13,14 +13,20 @@ from rse_pf.local.state import PlatformState, ServerState
 
 __all__ = ["connected_robots", "robots_table"]
 
+# Time limit of the request to a server, in seconds.
 _TIMEOUT_S = 3.0
 _COLUMNS = ("robot", "tenant", "server", "codec", "connected for", "commands", "last result")
+# Indices of the columns that are aligned to the right.
 _RIGHT = (4, 5)
+# Units in which a duration is shown, with their lengths in seconds, longest first.
 _UNITS = ((86400, "d"), (3600, "h"), (60, "min"))
 
 
 def connected_robots(state: PlatformState) -> dict[str, Any]:
-    """Return ``robots``, a list of rows; ``count``, of all; ``silent``, servers that did not answer.
+    """Ask each server of the platform for its robots, and return them as plain JSON values.
+
+    ``robots`` has a row for each robot that the servers name, sorted by tenant and name; ``count`` is the
+    number of all connected robots, which may be larger; ``silent`` names the servers that did not answer.
 
     Raises:
         UsageError: The file of the control token cannot be read.
@@ -41,7 +47,7 @@ def connected_robots(state: PlatformState) -> dict[str, Any]:
 
 
 def robots_table(document: Mapping[str, Any]) -> list[str]:
-    """Return the lines for a terminal."""
+    """Return the result of `connected_robots` as the lines of a table."""
     rows = [_COLUMNS, *map(_row, document["robots"])]
     if not document["robots"]:
         return ["no robot is connected"]
@@ -58,6 +64,7 @@ def robots_table(document: Mapping[str, Any]) -> list[str]:
 
 
 async def _ask_all(servers: Sequence[ServerState], token: str | None) -> list[dict[str, Any] | None]:
+    """Return the /robots page of each of *servers*, in their order; None for one that does not answer."""
     replies = await asyncio.gather(
         *(
             ControlPort(server.control_port, token).ask_once("/robots", timeout_s=_TIMEOUT_S)

@@ -1,4 +1,4 @@
 """The verbs map and camera: maps that robots share, maps from cameras and bags, live maps, calibration.
 
-What a person reads and types belongs here; the work is in `client_sdk` and `rse_pf.maps`.
+Options and printed text belong here; the work is in `client_sdk` and `rse_pf.maps`.
 """

@@ -1,6 +1,6 @@
 """Back up the maps of a tenant in a file and restore them: ``rse-pf map backup`` and ``map restore``.
 
-Works on the store, while the platform runs or while it is stopped.
+Both work on the object store itself, so the platform may run or be stopped.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ __all__ = ["BackupRequest", "RestoreRequest", "run_backup", "run_restore"]
 
 @dataclass(frozen=True, kw_only=True)
 class BackupRequest(StoreRequest):
-    """A file to which the maps of a tenant are written."""
+    """The options of rse-pf map backup: a tenant, a store, and the file that is written."""
 
     file: Path = option(metavar="FILE", help="the backup; an earlier one is replaced")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RestoreRequest(StoreRequest):
-    """A backup from which the maps of a tenant are restored."""
+    """The options of rse-pf map restore: a tenant, a store, and the backup that is read."""
 
     file: Path = option(metavar="FILE", help="the backup, which rse-pf map backup wrote")
     overwrite: bool = option(
@@ -46,7 +46,7 @@ class RestoreRequest(StoreRequest):
 
 
 def run_backup(request: BackupRequest, settings: PlatformSettings) -> None:
-    """Write the backup."""
+    """Write all maps of the tenant to the file, which is replaced in one step, and print what was written."""
     settings = request.settings_with_store(settings)
     maps = open_maps(settings, request.tenant)
     if not maps.names():
@@ -62,7 +62,7 @@ def run_backup(request: BackupRequest, settings: PlatformSettings) -> None:
 
 
 def run_restore(request: RestoreRequest, settings: PlatformSettings) -> None:
-    """Check the backup, and restore it."""
+    """Check the whole backup, write the versions that the store lacks, and print how many these were."""
     settings = request.settings_with_store(settings)
     check_exists(request.file, "name a file that rse-pf map backup wrote")
     with request.file.open("rb") as file, at_work("restoring the backup"):
@@ -78,6 +78,12 @@ def run_restore(request: RestoreRequest, settings: PlatformSettings) -> None:
 
 
 def _restore(request: RestoreRequest, settings: PlatformSettings, backup: CheckedBackup) -> int:
+    """Restore *backup*, and return the number of versions that were written.
+
+    Raises:
+        UsageError: It is a backup of another tenant.
+        QuotaExceeded: The versions would exceed the tenant's quota; nothing is written then.
+    """
     content = backup.content
     if content.tenant != request.tenant:
         raise UsageError(
@@ -95,7 +101,13 @@ def _restore(request: RestoreRequest, settings: PlatformSettings, backup: Checke
 
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a new file that replaces *path* in one step, durably, unless the caller raises an error."""
+    """Yield a new file that replaces *path* in one step after the block, and is on the disk then.
+
+    If the block raises an error, *path* stays as it was.
+
+    Raises:
+        UsageError: No file can be created in the folder of *path*.
+    """
     folder = path.absolute().parent
     temporary = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
     try:

@@ -1,6 +1,7 @@
 """Make a map from a ROS bag, and write maps as bags: ``rse-pf map from-bag`` and ``rse-pf map to-bag``.
 
-Needs no ROS.  The bag is read by `client_sdk.bags`, and driven like a camera.
+ROS need not be installed.  `client_sdk.bags` reads the bag, and its frames are tracked like those of a
+camera.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ if TYPE_CHECKING:
 
 __all__ = ["FromBagRequest", "ToBagRequest", "export_bag", "run_from_bag", "run_to_bag"]
 
+# Format of a bag by the ending of its file name.
 _ENDINGS: dict[str, BagKind] = {".bag": "ros1", ".db3": "sqlite3", ".mcap": "mcap"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class FromBagRequest(DriveRequest):
-    """A ROS bag from which a map is made."""
+    """The options of rse-pf map from-bag: a ROS bag, its topics, and those of every drive."""
 
     author = "rse-pf map from-bag"
     source: str = option(metavar="BAG", help="a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag")
@@ -78,7 +80,7 @@ class FromBagRequest(DriveRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class ToBagRequest:
-    """A folder of results that is written as a ROS bag."""
+    """The options of rse-pf map to-bag: a folder of results, and the ROS bag that is written."""
 
     source: Path = option(metavar="DIR", help="results of demo, map from-bag or map from-camera")
     out: Path = option(
@@ -92,7 +94,12 @@ class ToBagRequest:
 
 
 def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
-    """Track the frames of a bag and write the results; the exit code is 1 if most have no pose."""
+    """Track the frames of a bag and write the results; return 0.
+
+    Raises:
+        CommandFailed: Half of the frames or more have no pose; the results are written nevertheless.
+        UsageError: The bag cannot be read, or options contradict each other.
+    """
     require("map from-bag")
     scale = check_drive(request)
     options = _options(request)
@@ -120,6 +127,7 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
         frames.check()
 
         def about(path: Trajectory) -> dict[str, Any]:
+            """Return the fields of the report about the bag, and the errors of *path*."""
             return {
                 "bag": request.source,
                 "topics": {
@@ -141,7 +149,10 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
 
 
 def run_to_bag(request: ToBagRequest, settings: PlatformSettings) -> int:
-    """Write the results of a folder as a bag."""
+    """Write trajectories and point clouds of a folder of results as a bag; return 0.
+
+    If there is a merged cloud, it is written in place of the robots' clouds.
+    """
     require("map to-bag")
     kind = _kind(request.out, request.format)
     from client_sdk.bags import write_map_bag
@@ -164,7 +175,9 @@ def run_to_bag(request: ToBagRequest, settings: PlatformSettings) -> int:
 
 
 def export_bag(file: Path, version: MapVersion) -> int:
-    """Write a version of a map as one MCAP file that ROS 2 and Foxglove read; return its size, bytes.
+    """Write *version* of a map as the MCAP *file*, which ROS 2 and Foxglove read; return its size in bytes.
+
+    It holds the path of each robot's keyframes, and the points with colours.
 
     Raises:
         MissingExtra: ``rosbags`` is not installed.
@@ -186,6 +199,7 @@ def export_bag(file: Path, version: MapVersion) -> int:
 
 
 def _options(request: FromBagRequest) -> BagOptions:
+    """Return the options with which the bag is opened; raises UsageError if --intrinsics cannot be read."""
     from client_sdk.bags import BagOptions, lens_or_rig
 
     lens, rig = (None, None) if request.intrinsics is None else lens_or_rig(request.intrinsics)
@@ -206,6 +220,11 @@ def _options(request: FromBagRequest) -> BagOptions:
 
 
 def _kind(out: Path, named: BagKind | None) -> BagKind:
+    """Return the format of the bag *out*: *named*, else by its ending, else MCAP.
+
+    Raises:
+        UsageError: The ending is that of another format, or a ROS 1 bag is not named ``.bag``.
+    """
     by_ending = _ENDINGS.get(out.suffix)
     if named is None:
         return by_ending or "mcap"
@@ -217,7 +236,11 @@ def _kind(out: Path, named: BagKind | None) -> BagKind:
 
 
 def _robot_folders(folder: Path) -> list[Path]:
-    """Return the folders that hold a trajectory: the folder itself, or those of the demo's robots."""
+    """Return the folders with a trajectory: *folder* itself, and its subfolders ``robot-*`` of a demo.
+
+    Raises:
+        UsageError: There is none.
+    """
     found = [
         each for each in (folder, *sorted(folder.glob("robot-*"))) if (each / "trajectory.txt").is_file()
     ]

@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 
 __all__ = ["ACTION"]
 
+# A calibration with a board stops reading images once this many of them show the board in different views.
 _WANTED_VIEWS = 25
-_LIVE_IMAGES = 3000
-"""A calibration with a device ends after this number of images even if there are too few views."""
+# Images after which a calibration with a live camera, or by motion, stops reading: 100 s at 30 Hz.
+_MAX_IMAGES = 3000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ class _BoardRequest:
     )
 
     def read_board(self) -> Board:
-        """Return the board; raises UsageError."""
+        """Return the board of the options, by default 9x6 inner corners and 25 mm; raises UsageError."""
         from client_sdk.cameras.board import Board
 
         return Board.parse(self.board or "9x6", 25.0 if self.square_mm is None else self.square_mm)
@@ -93,7 +94,7 @@ class _CalibrateRequest(_BoardRequest):
 
     @property
     def file(self) -> Path:
-        """The file that is written."""
+        """The file that the calibration is written to."""
         return self.out or Path("rig.json" if self.stereo else "intrinsics.json")
 
 
@@ -105,7 +106,7 @@ class _CheckRequest:
 
 
 def write_board_file(request: _WriteRequest, settings: PlatformSettings) -> None:
-    """Write a board that can be printed."""
+    """Write a chessboard as a PDF that can be printed, and print its size."""
     from client_sdk.cameras.board import write_board
 
     board = request.read_board()
@@ -118,7 +119,10 @@ def write_board_file(request: _WriteRequest, settings: PlatformSettings) -> None
 
 
 def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> None:
-    """Calibrate by views of a board, or by the motion of the camera without a board."""
+    """Estimate the intrinsics of a camera, or with --stereo of a rig, and write them to a file.
+
+    With --board, --square-mm or --stereo, images of a chessboard are used, else the motion of the camera.
+    """
     from client_sdk.cameras.open_camera import is_device
 
     has_board = request.board is not None or request.square_mm is not None or request.stereo
@@ -146,6 +150,7 @@ def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> 
 
 
 def _calibrate_with_board(request: _CalibrateRequest, board: Board) -> None:
+    """Calibrate one camera by images of *board*; a live camera is read until there are enough views."""
     from client_sdk.cameras.calibration import BoardViews, calibrate
     from client_sdk.cameras.open_camera import is_device
     from client_sdk.rigs.intrinsics import write_intrinsics
@@ -158,7 +163,7 @@ def _calibrate_with_board(request: _CalibrateRequest, board: Board) -> None:
             f"{len(views.views)} of {_WANTED_VIEWS} views in {views.images} images; move and tilt the board",
             is_over=False,
         )
-        if len(views.views) >= _WANTED_VIEWS or (is_live and views.images >= _LIVE_IMAGES):
+        if len(views.views) >= _WANTED_VIEWS or (is_live and views.images >= _MAX_IMAGES):
             break
     show_progress(f"{len(views.views)} views in {views.images} images; computing", is_over=True)
     calibration = calibrate(views, max_rms_px=request.max_rms_px, depth_scale=request.depth_scale)
@@ -172,6 +177,7 @@ def _calibrate_with_board(request: _CalibrateRequest, board: Board) -> None:
 
 
 def _calibrate_from_motion(request: _CalibrateRequest) -> None:
+    """Calibrate one camera by selected views of a scene, and write its standard deviations, too."""
     from client_sdk.cameras.self_calibration import calibrate_from_motion
     from client_sdk.cameras.view_selection import select_views
     from client_sdk.rigs.intrinsics import intrinsics_to_json, write_json
@@ -181,7 +187,7 @@ def _calibrate_from_motion(request: _CalibrateRequest) -> None:
     def on_progress(step: str) -> None:
         show_progress(f"{len(views)} views of {images} images: {step}", is_over=False)
 
-    views, images = select_views(itertools.islice(_raw_images(request.sources), _LIVE_IMAGES))
+    views, images = select_views(itertools.islice(_raw_images(request.sources), _MAX_IMAGES))
     found = calibrate_from_motion(
         views,
         max_rms_px=request.max_rms_px,
@@ -205,6 +211,7 @@ def _calibrate_from_motion(request: _CalibrateRequest) -> None:
 
 
 def _calibrate_stereo(request: _CalibrateRequest, board: Board) -> None:
+    """Calibrate two cameras and their relative pose by pairs of images of *board*."""
     from client_sdk.cameras.open_camera import is_device
     from client_sdk.cameras.stereo_calibration import PairViews, calibrate_pair
     from client_sdk.rigs.rig_file import write_rig
@@ -218,7 +225,7 @@ def _calibrate_stereo(request: _CalibrateRequest, board: Board) -> None:
             "move and tilt the board",
             is_over=False,
         )
-        if len(views.pairs) >= _WANTED_VIEWS or (is_live and views.left.images >= _LIVE_IMAGES):
+        if len(views.pairs) >= _WANTED_VIEWS or (is_live and views.left.images >= _MAX_IMAGES):
             break
     show_progress(f"{len(views.pairs)} views of both; computing", is_over=True)
     found = calibrate_pair(views, max_rms_px=request.max_rms_px)
@@ -235,7 +242,14 @@ def _calibrate_stereo(request: _CalibrateRequest, board: Board) -> None:
 
 
 def _raw_pairs(sources: Sequence[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]]:
-    """Yield grey images of both cameras."""
+    """Yield pairs of grey images, left and right.
+
+    They are of two sources, of the folders ``left`` and ``right`` of one source, or halves of the images of
+    one source, in which both cameras are side by side.
+
+    Raises:
+        UsageError: There are more than two sources.
+    """
     if len(sources) > 2:
         raise UsageError(
             f"{len(sources)} sources of a pair", hint="name two devices, videos or folders, or one of both"
@@ -252,7 +266,13 @@ def _raw_pairs(sources: Sequence[str]) -> Iterator[tuple[npt.NDArray[np.uint8], 
 
 
 def _raw_images(sources: Sequence[str]) -> Iterator[npt.NDArray[np.uint8]]:
-    """Yield grey images as the lens gives them; of a recording those of its first or left camera."""
+    """Yield grey images of *sources* without undistortion: image files, folders, or one video or device.
+
+    Of a EuRoC recording, the images of its left camera.
+
+    Raises:
+        UsageError: A folder has no image, or several sources are not all images.
+    """
     from client_sdk.cameras.folder import list_folder
     from client_sdk.cameras.opencv_video import open_video
     from client_sdk.datasets.images import is_image, read_colour
@@ -277,7 +297,10 @@ def _raw_images(sources: Sequence[str]) -> Iterator[npt.NDArray[np.uint8]]:
 
 
 def check_camera(request: _CheckRequest, settings: PlatformSettings) -> int:
-    """Show what the frames of a camera are like; the exit code is 1 if most are blurred."""
+    """Print size, rate, depth and blur of the first --frames frames of a source.
+
+    Returns 1 if more than half of them are blurred or empty, else 0.
+    """
     if request.frames < 2:
         raise UsageError(f"--frames {request.frames} is below 2", hint="60 is two seconds of a webcam")
     from client_sdk.check.images import FrameStatistics
@@ -311,9 +334,9 @@ def check_camera(request: _CheckRequest, settings: PlatformSettings) -> int:
 
 
 def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], str]]:
-    """Yield time stamp, colours, and ``depth``, ``a stereo pair`` or nothing.
+    """Yield for each frame of *source* its time stamp in s, its colours, and what measures distances.
 
-    A video and a device need no intrinsics here.
+    That is ``depth``, ``a stereo pair``, or "" for neither.  A video and a device need no intrinsics here.
     """
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.folder import list_folder

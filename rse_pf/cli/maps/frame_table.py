@@ -1,4 +1,4 @@
-"""The frames of a drive, one row each: which frame has no pose or a weak one, and why (``frames.csv``)."""
+"""The table of all frames of a drive, ``frames.csv``: which frame has no pose or a weak one, and why."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ if TYPE_CHECKING:
 
 __all__ = ["FRAMES_FILE", "FrameTable", "named_frames"]
 
+# Name of the table in the folder of results.
 FRAMES_FILE = "frames.csv"
 _COLUMNS = (
     "frame", "timestamp_s", "status", "verdict", "reason", "keyframe", "matches", "inliers", "sigma_position",
     "source", "round_trip_ms",
 )  # fmt: skip
+# Numbers or ranges of frames that a printed line names; further ones become ``...``.
 _MOST_NAMED = 8
 
 
 class FrameTable:
-    """Collects what became of each frame, and says it in a file and in a few lines."""
+    """Collects the tracking result of each frame, and writes all as a table and the worst as a few lines."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[str, ...]] = []
@@ -37,7 +39,7 @@ class FrameTable:
         self._reasons: Counter[str] = Counter()
 
     def add(self, tracked: TrackedFrame) -> None:
-        """Add the next frame; frames are counted from 1."""
+        """Add the result of the next frame; frames are numbered from 1."""
         number = len(self._rows) + 1
         has_pose = tracked.T_world_camera is not None
         verdict = ("weak" if tracked.reason else "ok") if has_pose else "none"
@@ -58,7 +60,7 @@ class FrameTable:
         )  # fmt: skip
 
     def lines(self) -> Iterator[str]:
-        """Yield which frames were lost and which poses are weak, with the most frequent reason."""
+        """Yield a line on lost frames with the most frequent reason, and a line on weak poses, if any."""
         if self._lost:
             (reason, _), *others = self._reasons.most_common()
             more = f" (and {counted(len(others), 'other reason')}: see {FRAMES_FILE})" if others else ""
@@ -67,7 +69,7 @@ class FrameTable:
             yield f"weak poses: {named_frames(self._weak)}; {FRAMES_FILE} says why"
 
     def write(self, path: Path) -> None:
-        """Write the rows.
+        """Write the table as CSV to *path*.
 
         Raises:
             UsageError: The file cannot be written.
@@ -82,7 +84,7 @@ class FrameTable:
 
 
 def named_frames(numbers: list[int]) -> str:
-    """Return ``frames 3, 7-9`` for sorted numbers; the first few of many."""
+    """Return words such as ``frames 3, 7-9`` for sorted *numbers*; after 8 numbers or ranges, ``...``."""
     ranges = []
     for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         run = [number for _, number in group]

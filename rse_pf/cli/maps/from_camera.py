@@ -1,7 +1,7 @@
 """Make a map from a camera: ``rse-pf map from-camera``.
 
-Starts a platform on this machine unless another one is named, tracks the camera until it ends or Ctrl-C is
-pressed, and writes map, trajectory, report and picture.
+Starts a platform on this machine unless an option names another, tracks the frames of the camera until there
+are no more or Ctrl-C is pressed, and writes map, trajectory, report and picture into a folder of results.
 """
 
 from __future__ import annotations
@@ -43,19 +43,20 @@ if TYPE_CHECKING:
 
 __all__ = ["DriveRequest", "FromCameraRequest", "check_drive", "errors_of", "map_source", "run_from_camera"]
 
+# Name of the robot in the map and its picture.
 _ROBOT = "camera"
-_MOST = 0.5
-"""Share of frames without a pose above which the command has failed."""
+# Part of all frames: if at least so many have no pose in the map, the command fails.
+_MAX_LOST = 0.5
+# Time between two lines of progress, in seconds, if standard error is a file or pipe.
 _LINE_EVERY_S = 5.0
-"""Time between two lines of progress in a file or pipe."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveRequest(CheckRequest, KeepRequest):
-    """Frames of any source from which a map is made, and what becomes of the map."""
+    """The options of every drive: how frames are tracked, the platform, and where the map is kept."""
 
     author: ClassVar[str]
-    """Who made the map, as its versions name it."""
+    """The command that made the map; the record of a version of the map names it."""
 
     source: str
     out: Path
@@ -98,7 +99,7 @@ class DriveRequest(CheckRequest, KeepRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class FromCameraRequest(SensorRequest, DriveRequest):
-    """A camera, a video or images from which a map is made."""
+    """The options of rse-pf map from-camera: the source of frames, and those of every drive."""
 
     author = "rse-pf map from-camera"
     source: str = option(
@@ -110,7 +111,13 @@ class FromCameraRequest(SensorRequest, DriveRequest):
 
 
 def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> int:
-    """Track the camera and write the results; the exit code is 1 if most frames have no pose."""
+    """Track the frames of a source and write the results; return 0.
+
+    Raises:
+        CommandFailed: Half of the frames or more have no pose, or the source failed in between; the results
+            are written nevertheless.
+        UsageError: The source cannot be opened, or options contradict each other.
+    """
     scale = check_drive(request)
     from client_sdk.cameras import open_camera
     from client_sdk.check.motion import MotionReference, read_odometry
@@ -131,6 +138,7 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
         reference = truth or reference
 
     def about(path: Trajectory) -> dict[str, Any]:
+        """Return the errors of *path* for the report; empty if the source states no true poses."""
         if recording is None or recording.truth is None:
             return {}
         return errors_of(path, recording.truth, recording.truth_kind, recording.T_body_camera)
@@ -149,7 +157,7 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
 
 
 def _recording(request: FromCameraRequest) -> Dataset | None:
-    """Return the recording that the source is, for its true poses; None if it is a camera or a video."""
+    """Open the source as a recording, whose true poses are compared; None if it is a camera or a video."""
     from client_sdk.cameras.open_camera import is_recording
     from client_sdk.datasets import open_dataset
 
@@ -162,7 +170,14 @@ def _recording(request: FromCameraRequest) -> Dataset | None:
 def errors_of(
     path: Trajectory, truth: Trajectory | None, kind: str, T_body_camera: Array | None = None
 ) -> dict[str, Any]:
-    """Return the errors of a path against what *kind* names, for a report; of the body where one is given."""
+    """Return the errors of a trajectory for a report.
+
+    Args:
+        path: Estimated poses of the camera.
+        truth: True poses; None if there are none.
+        kind: What *truth* is, in words of the report.
+        T_body_camera: Maps camera to body; with it the poses of the body are compared.  None: of the camera.
+    """
     from rse_pf.extensions.experiments.results.trajectory_error import trajectory_figures
 
     return {"truth": kind, **trajectory_figures(path, truth, T_body_camera)}
@@ -176,9 +191,20 @@ def map_source(
     about: Callable[[Trajectory], dict[str, Any]] | None = None,
     reference: MotionReference | None = None,
 ) -> int:
-    """Track the frames of *source* and write the results.
+    """Track the frames of *source*, write the results, and commit the map to the store; return 0.
 
-    *about* adds to the report what it returns; the motion is compared with that of *reference*.
+    Args:
+        request: The options of the drive.
+        settings: Settings of the platform and the store.
+        source: The frames, with what is known about their camera.
+        scale: The source of metric scale for a camera without depth and stereo; None leaves it unknown.
+        about: Returns further fields of the report for the finished trajectory.
+        reference: A motion with which the tracked motion is compared; None compares nothing.
+
+    Raises:
+        UsageError: *scale* is given although the source has depth or stereo, or the source gives no frame.
+        CommandFailed: Half of the frames or more have no pose, or the source failed in between; the results
+            are written nevertheless.
     """
     if scale is not None and (source.has_depth or source.has_stereo):
         what, option = ("depth", "--no-depth") if source.has_depth else ("a pair of cameras", "--camera left")
@@ -196,6 +222,7 @@ def map_source(
     check = DriveCheck(is_wanted=request.check, is_thinned=request.rate is not None)
 
     def watch(frame: Frame, tracked: TrackedFrame) -> None:
+        """Check a tracked frame, and write its image if it is a keyframe."""
         check.add(frame, tracked)
         if images is not None:
             images.add(tracked)
@@ -213,7 +240,7 @@ def map_source(
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if report["unit"] != "m" and report.get("ate_cm") is not None:
-        report |= dict.fromkeys(("path_m", "ate_cm", "rpe_cm"))  # a path without scale has no centimetres
+        report |= dict.fromkeys(("path_m", "ate_cm", "rpe_cm"))  # no metres without metric scale
     if checked is not None:
         report["check"] = checked
     kept, kept_line = _keep(request, mapper, kept_in, images)
@@ -247,7 +274,7 @@ def map_source(
     if failed is not None:
         raise CommandFailed(f"the source failed after {report['frames']} frames: {failed.message}",
                             hint=failed.hint)  # fmt: skip
-    if posed <= (1 - _MOST) * report["frames"]:
+    if posed <= (1 - _MAX_LOST) * report["frames"]:
         findings = (checked or {}).get("source") or [doubt.to_dict() for doubt in doubts]
         raise CommandFailed(
             f"{report['frames'] - posed} of {report['frames']} frames have no pose in the map: "
@@ -259,7 +286,10 @@ def map_source(
 
 
 def offset_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the line about a stereo drive that was corrected when it was saved; none if it was not."""
+    """Return the line about an offset of the disparity that was corrected when a stereo drive was saved.
+
+    An empty list if none was found.
+    """
     offset_px, deviation_px = (report.get(f"disparity_offset{each}_px") for each in ("", "_deviation"))
     if not offset_px:
         return []
@@ -270,7 +300,7 @@ def offset_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the line with the error of a path; none without a ground truth, or without a scale."""
+    """Return the line with ATE and RPE (cm) of *report*; an empty list without true poses or metric scale."""
     if report.get("ate_cm") is None:
         return []
     rpe = "" if report["rpe_cm"] is None else f", RPE {report['rpe_cm']:.2f} cm"
@@ -280,7 +310,11 @@ def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
 def _keep(
     request: DriveRequest, mapper: Mapper, settings: PlatformSettings, images: KeyframeImages | None
 ) -> tuple[dict[str, Any], str]:
-    """Keep the map, so that others can be found in it; return the fields of the report, and a line."""
+    """Commit the map to the store, where others can localise in it; return fields of the report, and a line.
+
+    A map that cannot be kept is no error: fields and line then state the reason.  The *images* of its
+    keyframes are renamed as the map names them.
+    """
     data, kept = None, {}
     try:
         data = mapper.encoded_map()
@@ -304,7 +338,13 @@ def _keep(
 
 
 def check_drive(request: DriveRequest) -> OdometryScale | MarkerScale | None:
-    """Refuse options that contradict each other, and return the scale; raises UsageError."""
+    """Check the options of a drive, before its source is opened, and return the source of metric scale.
+
+    None without --scale.
+
+    Raises:
+        UsageError: Options contradict each other, or a value is not valid.
+    """
     from client_sdk.plugins import load_features
 
     load_features(request.features)
@@ -322,7 +362,13 @@ def check_drive(request: DriveRequest) -> OdometryScale | MarkerScale | None:
 
 
 def _scale(word: str | None) -> OdometryScale | MarkerScale | None:
-    """Return the source of metres that ``marker:MM`` or ``odometry:FILE`` names."""
+    """Return the source of metric scale that *word*, ``marker:MM`` or ``odometry:FILE``, names.
+
+    None if *word* is None.
+
+    Raises:
+        UsageError: *word* has another form, or the file cannot be read.
+    """
     from client_sdk import MarkerScale, OdometryScale
     from client_sdk.check.motion import read_odometry
 
@@ -353,9 +399,14 @@ async def _drive(
     frames: FrameTable,
     watch: Callable[[Frame, TrackedFrame], None],
 ) -> tuple[Mapper, RsePfError | None]:
-    """Track all frames, each of which *watch* gets; return the error that ended the source, if one did.
+    """Track the frames of *source* until there are no more, --frames are tracked, or Ctrl-C.
 
-    Ctrl-C, or a source that fails, ends the drive, and what was mapped is kept.
+    Returns the mapper with the map, and the error with which the source failed after its first frame, else
+    None; what was mapped until then is kept.  *frames* and *watch* get the result of each frame.
+
+    Raises:
+        UsageError: The source gives no frame.
+        RsePfError: The source failed at its first frame.
     """
     from client_sdk.plugins import load_features
 
@@ -389,7 +440,10 @@ async def _drive(
 
 @contextlib.asynccontextmanager
 async def _robot(request: DriveRequest, settings: PlatformSettings) -> AsyncIterator[Robot]:
-    """Connect to the named platform, or to one that is started for the drive."""
+    """Yield a robot that is connected to the platform that the options name, or to one that is started.
+
+    A platform that is started has its state in the folder of results, and is stopped after the block.
+    """
     from client_sdk import connect
 
     if request.enrolment is not None:
@@ -421,7 +475,10 @@ async def _robot(request: DriveRequest, settings: PlatformSettings) -> AsyncIter
 
 
 class _Status:
-    """The line of a drive: rewritten on a terminal, written every few seconds to a file or pipe."""
+    """The line of progress of a drive: rewritten on a terminal, else written every `_LINE_EVERY_S` seconds.
+
+    *now* is a monotonic clock in seconds.
+    """
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -429,7 +486,7 @@ class _Status:
         self._last = ""
 
     def show(self, mapper: Mapper, done: TrackedFrame) -> None:
-        """Say how the last frame went."""
+        """Show the result of the last frame, *done*, and the counts of *mapper*."""
         trip = "" if done.round_trip_ms is None else f", {done.round_trip_ms:.1f} ms ({done.source})"
         how = f"{done.inliers} inliers{trip}" if done.T_world_camera is not None else done.reason
         scale = "" if done.scale == "metric" else ", up to scale"
@@ -442,14 +499,18 @@ class _Status:
             self._due_s = self._now() + _LINE_EVERY_S
 
     def end(self) -> None:
-        """End the line."""
+        """Show the last line once more, and leave it on the terminal."""
         show_progress(self._last, is_over=True)
 
 
 def _advice(
     mapper: Mapper, source: FrameSource, check: DriveCheck, findings: Sequence[Mapping[str, Any]]
 ) -> str:
-    """Return what to do about frames without a pose: by what the images show, a finding, or the sensors."""
+    """Return the hint about frames without a pose.
+
+    It names the cause that *check* sees in the images, else the first of *findings*, else a cause that
+    follows from the sensors of *source*.
+    """
     cause = check.cause_of_loss()
     if cause is not None:
         return cause

@@ -1,6 +1,6 @@
-"""The images of the keyframes of a drive, as JPEG files under the names that exported maps give them.
+"""Write the images of a drive's keyframes as JPEG files, named as exported maps refer to them.
 
-They lie in the folder of results alone: neither the map nor the platform gets them.
+The files are in the folder of results only; neither the map nor the platform gets the images.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from rse_pf.storage.files import replace_file
 
 __all__ = ["KeyframeImages"]
 
+# JPEG quality of the images, 0 to 100.
 _QUALITY = 95
 
 
 class KeyframeImages:
-    """The images of one drive."""
+    """The images of the keyframes of one drive, in a folder of results."""
 
     def __init__(self, out: Path) -> None:
-        """Keep none yet; they go into the folder ``images`` of *out*."""
+        """Write nothing yet; images go into the folder ``images`` in *out*."""
         self._folder = out / IMAGES_FOLDER
         self._files: dict[float, Path] = {}
 
     def add(self, tracked: TrackedFrame) -> None:
-        """Keep an image if its frame is a keyframe, or may become one.
+        """Write the image of a frame if it is a keyframe, or may become one later, else do nothing.
 
         Raises:
-            UsageError: It cannot be written.
+            UsageError: The file cannot be written.
         """
         if not (tracked.keyframe or tracked.status in ("first", "starting")):
             return
@@ -48,7 +49,10 @@ class KeyframeImages:
         self._files[frame.timestamp_s] = file
 
     def finish(self, version: MapVersion | None) -> int:
-        """Name the images of the keyframes of *version* and remove the others; return how many stay."""
+        """Rename the images of the keyframes of *version*, and remove all others; return how many stay.
+
+        Without a *version*, all are removed.
+        """
         named = {} if version is None else {k.timestamp_s: k.image_name for k in version.keyframes}
         for timestamp_s, file in self._files.items():
             if timestamp_s in named:

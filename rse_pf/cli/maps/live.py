@@ -1,7 +1,8 @@
-"""Live maps, which robots make together while they drive: ``rse-pf map live`` and ``rse-pf map publish``.
+"""Show and change live maps, which robots make together: ``rse-pf map live`` and ``rse-pf map publish``.
 
-Works on the store, and through it with the map server of the map, which must be reachable from this machine.
-If no server has the map now, a map server is started here for the command; ``list`` and ``show`` start none.
+Each live map has one map server, a process of some backend server; its address is in the store, and it must
+be reachable from this machine.  If no server has the map now, a map server is started here for the time of
+the command; ``list`` and ``show`` start none.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = ["LIVE_ACTIONS", "run_publish"]
 
+# Time limit of a request to a map server, in seconds.
 _DEADLINE_S = 30.0
-_MAP_SERVER_S = 3.0
-"""Time in seconds after which the map server of a map that is only shown counts as lost."""
+# Time limit of that request in ``show``, in seconds; then the map is read from the store.
+_SHOW_DEADLINE_S = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,7 @@ class _ForgetRequest(MapRequest):
 
 
 def run_publish(request: MapRequest, settings: PlatformSettings) -> None:
-    """Publish a live map as the next version of the map of the same name."""
+    """Publish a live map as the next version of the map of the same name, and print that version."""
     settings = request.settings_with_store(settings)
     reply = _ask(request, settings, "live-publish", LiveMapRequest(map=request.name))
     _record(request, settings, reply)
@@ -64,17 +66,21 @@ def run_publish(request: MapRequest, settings: PlatformSettings) -> None:
 
 
 def _list(request: StoreRequest, settings: PlatformSettings) -> None:
+    """Print name, state and map server of each live map of the tenant."""
     settings = request.settings_with_store(settings)
-    rows = asyncio.run(_with_links(settings, lambda links: links.list_maps(request.tenant)))
+    rows = asyncio.run(_with_client(settings, lambda client: client.list_maps(request.tenant)))
     lines = [f"{row['name']:<24} {row['state']:<8} {row['server']}" for row in rows]
     request.print(rows, *(lines or ["no live maps"]))
 
 
 def _show(request: MapRequest, settings: PlatformSettings) -> None:
+    """Print state, map server, size and robots of a live map, from its map server or else from the store."""
     settings = request.settings_with_store(settings)
     try:
         without_servers = settings.replace(live={"max_owners": 0})
-        reply = _ask(request, without_servers, "live-show", LiveMapRequest(map=request.name), _MAP_SERVER_S)
+        reply = _ask(
+            request, without_servers, "live-show", LiveMapRequest(map=request.name), _SHOW_DEADLINE_S
+        )
     except Busy:
         reply = {}
     if not reply or reply["state"] == "none":
@@ -96,6 +102,7 @@ def _show(request: MapRequest, settings: PlatformSettings) -> None:
 
 
 def _start(request: _StartRequest, settings: PlatformSettings) -> None:
+    """Begin a live map, empty or with the keyframes of a version of a map."""
     settings = request.settings_with_store(settings)
     start = LiveStart(map=request.name, source=request.source, equal_rooms_m=request.equal_rooms_m)
     reply = _ask(request, settings, "live-start", start)
@@ -103,6 +110,7 @@ def _start(request: _StartRequest, settings: PlatformSettings) -> None:
 
 
 def _stop(request: MapRequest, settings: PlatformSettings) -> None:
+    """Publish a live map as a version, unless it is empty, and close it."""
     settings = request.settings_with_store(settings)
     reply = _ask(request, settings, "live-stop", LiveMapRequest(map=request.name))
     if reply:
@@ -116,6 +124,7 @@ def _stop(request: MapRequest, settings: PlatformSettings) -> None:
 
 
 def _forget(request: _ForgetRequest, settings: PlatformSettings) -> None:
+    """Remove all that one robot contributed to a live map."""
     settings = request.settings_with_store(settings)
     reply = _ask(request, settings, "live-forget", LiveForget(map=request.name, robot=request.robot))
     request.print(reply, f"{request.name} holds nothing of {request.robot} any more")
@@ -128,6 +137,7 @@ def _publication_line(name: str, reply: dict[str, Any]) -> str:
 
 
 def _record(request: MapRequest, settings: PlatformSettings, reply: dict[str, Any]) -> None:
+    """Write the version in *reply* to the platform's audit log, as ``map.commit``."""
     subject = str(RobotId(request.tenant, request.name))
     record_map_change(settings, "map.commit", subject, version=reply["version"], number=reply["number"])
 
@@ -136,39 +146,58 @@ def _ask(
     request: MapRequest, settings: PlatformSettings, operation: str, message: LiveRequest,
     deadline_s: float = _DEADLINE_S,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the answer of the map server; raises what it refuses, or Busy."""
+    """Send a request about the live map of *request* to its map server, and return the answer.
+
+    Args:
+        request: Tenant and name of the map.
+        settings: Settings with the store.
+        operation: Name of the operation, such as ``live-stop``.
+        message: Content of the request.
+        deadline_s: Time limit in seconds.
+
+    Raises:
+        Busy: No map server answered in time, or none may be started here.
+        RsePfError: The map server refused the request.
+    """
     from rse_pf.server.live_map.lease import map_folder
 
     map_folder(request.tenant, request.name)  # refuse a wrong name first
     operator = RobotId(request.tenant, "operator")
 
-    async def ask(links: LiveMapClient) -> dict[str, Any]:
-        return await links.request(request.tenant, request.name, operator, operation, message, deadline_s)
+    async def ask(client: LiveMapClient) -> dict[str, Any]:
+        return await client.request(request.tenant, request.name, operator, operation, message, deadline_s)
 
-    return asyncio.run(_with_links(settings, ask))
+    return asyncio.run(_with_client(settings, ask))
 
 
-async def _with_links(settings: PlatformSettings, act: Callable[[LiveMapClient], Any]) -> Any:
+async def _with_client(settings: PlatformSettings, act: Callable[[LiveMapClient], Any]) -> Any:
+    """Return what *act* returns for a client of all live maps in the store, which is then closed."""
     from rse_pf.server.live_map.client import LiveMapClient
     from rse_pf.server.log import JsonLog
 
     settings = settings.replace(
         serving={"log_level": "error"}
-    )  # the lines of the map server are for a server's log
+    )  # a map server that is started here logs errors only, on standard error
     log = JsonLog(level="error", server="operator", wall_clock=time.time).start()
-    links = LiveMapClient(
+    client = LiveMapClient(
         store=open_data_store(settings), settings=settings, server_id=f"operator-{os.getpid()}",
         log=log, on_update=lambda tenant, name, payload: None,
     )  # fmt: skip
     try:
-        return await act(links)
+        return await act(client)
     finally:
-        await links.close()
+        await client.close()
         log.close()
 
 
 def _read(request: MapRequest, settings: PlatformSettings) -> dict[str, Any]:
-    """Return the state in the log of a map that has no map server now; raises NotFound."""
+    """Return the state of a live map without a map server, from its lease and log in the store.
+
+    It has the form of the reply to ``live-show``.
+
+    Raises:
+        NotFound: There is no such live map, or it was stopped.
+    """
     from rse_pf.server.live_map.lease import decode_lease, lease_name, map_folder
     from rse_pf.server.live_map.map_server.environment import LIVE_MAP
     from rse_pf.server.live_map.map_server.log import LiveLog

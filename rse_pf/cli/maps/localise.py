@@ -1,4 +1,4 @@
-"""Localise images in a map: here, with the map of a store, or at a platform by HTTP."""
+"""Estimate the camera poses of images in a map: in this process, or by a platform over HTTP."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ if TYPE_CHECKING:
 __all__ = ["LocaliseRequest", "run_localise"]
 
 _FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
+# Largest image file that is read and sent to a platform, in bytes: it protects the memory of this process;
+# the platform has a limit of its own.
 _MAX_PHOTO_BYTES = 1 << 26
-"""Largest file that is read, in bytes: the platform has a limit of its own, this one protects memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocaliseRequest(MapRequest):
-    """Frames whose poses in a map are estimated, in this process or by a platform."""
+    """The options of rse-pf map localise: a map, frames, their camera, and the platform or store."""
 
     frames: tuple[str, ...] = option(
         nargs="+",
@@ -75,14 +76,17 @@ class LocaliseRequest(MapRequest):
 
 
 def run_localise(request: LocaliseRequest, settings: PlatformSettings) -> int:
-    """Estimate the poses at the platform that is named, else here; the exit code is 1 if none is found."""
+    """Estimate the pose of each frame, by the platform that an option names, else in this process.
+
+    Returns 0 if at least one pose has the verdict ok, else 1.
+    """
     if request.url is not None or request.enrolment is not None:
         return _localise_photos(request)
     return _localise_frames(request, request.open_maps(settings))
 
 
 def _localise_frames(request: LocaliseRequest, maps: MapRegistry) -> int:
-    """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
+    """Estimate the pose of each frame in a map of the store, and print it; return 1 if no verdict is ok."""
     from rse_pf.services.mapping.localise import locate
     from rse_pf.services.mapping.photo import location_of
     from rse_pf.services.mapping.place import open_map
@@ -112,7 +116,7 @@ def _localise_frames(request: LocaliseRequest, maps: MapRegistry) -> int:
 
 
 def _localise_photos(request: LocaliseRequest) -> int:
-    """Let a platform localise each photo and print a line for it; the exit code is 1 if none is found."""
+    """Have a platform estimate the pose of each photo, and print it; return 1 if no verdict is ok."""
     if request.store is not None or request.features is not None or request.every != 1:
         raise UsageError(
             "--store, --features and --every are for a map of a store", hint="leave them out, or leave --url"
@@ -132,6 +136,7 @@ def _localise_photos(request: LocaliseRequest) -> int:
 
 
 def _lens_of(request: LocaliseRequest) -> PhotoLens:
+    """Return the intrinsics of --camera or --intrinsics; raises UsageError unless exactly one is given."""
     if request.camera is not None and request.intrinsics is None:
         fx, fy, cx, cy = _four_numbers(request.camera)
         return PhotoLens(fx=fx, fy=fy, cx=cx, cy=cy)
@@ -151,6 +156,7 @@ def _lens_of(request: LocaliseRequest) -> PhotoLens:
 
 
 def _photo_files(path: Path) -> list[Path]:
+    """Return *path*, or the image files in it if it is a folder; raises UsageError if it has none."""
     from client_sdk.datasets.images import image_files
 
     if not path.is_dir():
@@ -162,6 +168,7 @@ def _photo_files(path: Path) -> list[Path]:
 
 
 def _photo(path: Path) -> bytes:
+    """Return the content of an image file; raises UsageError if it cannot be read, or is too large."""
     try:
         return read_regular_file(path, _MAX_PHOTO_BYTES)
     except OSError as error:
@@ -171,6 +178,7 @@ def _photo(path: Path) -> bytes:
 
 
 def _client(request: LocaliseRequest) -> DataClient:
+    """Return a client of the data service of the platform that --enrolment, or --url with a token, names."""
     from client_sdk.transfer.data_client import DataClient, DataOptions
 
     if request.enrolment is not None:
@@ -195,6 +203,7 @@ def _client(request: LocaliseRequest) -> DataClient:
 
 
 def _finish(request: LocaliseRequest, found: list[dict[str, Any]]) -> int:
+    """Print all results as JSON, or the number of poses that are ok; return 1 if that is 0, else 0."""
     good = sum(each["verdict"] == "ok" for each in found)
     if request.json:
         show_json(found, indent=2, sort_keys=True)
@@ -205,7 +214,7 @@ def _finish(request: LocaliseRequest, found: list[dict[str, Any]]) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _NamedFrame:
-    """A frame to localise: an image, or a row of a recording."""
+    """A frame to localise: an image file, or the frame ``row`` of a recording; ``label`` is its name."""
 
     label: str
     path: Path
@@ -214,6 +223,11 @@ class _NamedFrame:
 
 
 def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
+    """Yield every *every*-th frame of *word*: an image, a folder of images, a recording or a range of one.
+
+    Raises:
+        UsageError: There is no such image or recording, or it has fewer frames.
+    """
     path = Path(word)
     if path.is_file():
         yield _NamedFrame(label=word, path=path)
@@ -251,6 +265,11 @@ def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
 def _view_of(
     named: _NamedFrame, version: MapVersion, camera: str | None, plugin: FeaturesPlugin | None
 ) -> View:
+    """Return the camera and the features of a frame, to be matched with the map *version*.
+
+    The intrinsics of an image are those of *camera*, FX,FY,CX,CY, else of a camera of the map; a recording
+    has its own.  *plugin* finds the features; None uses ORB.
+    """
     from client_sdk.datasets import read_colour
     from client_sdk.frontend import Frame, FrontEndOptions, extract
     from rse_pf.slam.relative_pose import View
@@ -278,6 +297,7 @@ def _parse_lens(numbers: str, width: int, height: int) -> Camera:
 
 
 def _four_numbers(numbers: str) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy in px from the value of --camera; raises UsageError if it is not four numbers."""
     try:
         fx, fy, cx, cy = (float(number) for number in numbers.split(","))
     except ValueError as error:
@@ -288,7 +308,11 @@ def _four_numbers(numbers: str) -> tuple[float, float, float, float]:
 
 
 def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Camera:
-    """Return the camera of a keyframe with the same image size, which likely took the image."""
+    """Return the camera of the first keyframe whose images have this size, which likely took the image.
+
+    Raises:
+        UsageError: No camera of the map has this size; *label* names the image.
+    """
     for keyframe in version.keyframes:
         if (keyframe.camera.width, keyframe.camera.height) == (width, height):
             return keyframe.camera
@@ -299,6 +323,7 @@ def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Ca
 
 
 def _location_document(label: str, location: PhotoLocation) -> dict[str, Any]:
+    """Return the result for a frame as plain JSON values, with position (m), rotation and angle (deg)."""
     T = None if location.T_map_camera is None else np.array(location.T_map_camera)
     return {
         "frame": label, **msgspec.structs.asdict(location),
@@ -309,6 +334,7 @@ def _location_document(label: str, location: PhotoLocation) -> dict[str, Any]:
 
 
 def _location_line(found: dict[str, Any]) -> str:
+    """Return the result of `_location_document` as one line."""
     start = f"{found['frame']:<24} {found['verdict']:<4}"
     if found["position_m"] is None:
         return f"{start}  {found['reason']}, {found['inliers']} inliers"

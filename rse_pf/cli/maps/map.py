@@ -58,7 +58,9 @@ from rse_pf.terminal import at_work, counted, format_time
 
 __all__ = ["ACTION"]
 
+# Digits of the id of a version that are printed.
 _SHORT = 12
+# Characters of a value of the provenance that are printed; a longer one is cut.
 _MAX_VALUE = 80
 
 
@@ -106,6 +108,7 @@ class _PruneRequest(MapRequest):
 
 
 def _check_folder(file: Path) -> None:
+    """Raise UsageError if the folder of *file*, which is to be written, does not exist."""
     folder = file.absolute().parent
     if not folder.is_dir():
         raise UsageError(
@@ -114,6 +117,7 @@ def _check_folder(file: Path) -> None:
 
 
 def _list(request: StoreRequest, settings: PlatformSettings) -> None:
+    """Print the head of each map of the tenant."""
     maps = request.open_maps(settings)
     heads = {name: maps.head(name) for name in maps.names()}
     request.print(
@@ -123,6 +127,7 @@ def _list(request: StoreRequest, settings: PlatformSettings) -> None:
 
 
 def _show(request: _ShowRequest, settings: PlatformSettings) -> None:
+    """Print contents and origin of a version, or with --all a line for each version of the map."""
     if request.png is not None:
         _check_folder(request.png)
     maps = request.open_maps(settings)
@@ -175,7 +180,7 @@ def _view(request: _ViewRequest, settings: PlatformSettings) -> None:
 
 
 def _merge(request: _MergeRequest, settings: PlatformSettings) -> int:
-    """Merge maps into the next version of one; the exit code is 1 if any was not joined."""
+    """Merge maps of the store into the next version of map --into; return 1 if any map was not joined."""
     from rse_pf.services.mapping.merge import MergeRequest, merge_maps
 
     maps = request.open_maps(settings)
@@ -196,6 +201,7 @@ def _merge(request: _MergeRequest, settings: PlatformSettings) -> int:
 
 
 def _diff(request: _DiffRequest, settings: PlatformSettings) -> None:
+    """Print which keyframes, edges and points two versions of a map do not have in common."""
     maps = request.open_maps(settings)
     found = compare_versions(maps.load(request.name, request.before), maps.load(request.name, request.after))
     request.print(
@@ -210,6 +216,7 @@ def _diff(request: _DiffRequest, settings: PlatformSettings) -> None:
 
 
 def _rollback(request: _RollbackRequest, settings: PlatformSettings) -> None:
+    """Set the head of a map to an earlier version; no version is removed."""
     maps = request.open_maps(settings)
     head = maps.head(request.name)
     record = maps.move_head(request.name, request.version, expected=head.id)
@@ -220,6 +227,7 @@ def _rollback(request: _RollbackRequest, settings: PlatformSettings) -> None:
 
 
 def _prune(request: _PruneRequest, settings: PlatformSettings) -> None:
+    """Remove all versions of a map but the head and the --keep newest ones, and print them."""
     if request.keep < 1:
         raise UsageError(f"--keep {request.keep} is below 1", hint="1 keeps the head and the newest version")
     maps = request.open_maps(settings)
@@ -233,6 +241,7 @@ def _prune(request: _PruneRequest, settings: PlatformSettings) -> None:
 
 
 def _draw(png: Path, name: str, maps: MapRegistry, record: MapRecord) -> None:
+    """Draw points and paths of a version of map *name* into *png*; raises UsageError if it has none."""
     from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 
     _check_folder(png)
@@ -250,6 +259,7 @@ def _draw(png: Path, name: str, maps: MapRegistry, record: MapRecord) -> None:
 
 
 def _record_line(record: MapRecord) -> str:
+    """Return number, id, time, counts and note of a version as one line."""
     counts = ", ".join(
         (
             counted(record.keyframes, "keyframe"),
@@ -262,6 +272,7 @@ def _record_line(record: MapRecord) -> str:
 
 
 def _fields(record: MapRecord) -> dict[str, Any]:
+    """Return the record of a version as plain JSON values."""
     return {"id": record.id, **msgspec.to_builtins(record)}
 
 

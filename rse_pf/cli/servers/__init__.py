@@ -1,4 +1,4 @@
-"""The verbs serve and data, which run one server each, and the process of a warm standby.
+"""The verbs serve and data, which run one server each, and the program of a warm standby process.
 
-How a server works belongs to `rse_pf.server` and `rse_pf.data_server`.
+Options and printed text belong here; the servers themselves are in `rse_pf.server` and `rse_pf.data_server`.
 """

@@ -25,14 +25,14 @@ _ROWS = {row.name: row for row in setting_rows() if row.group == "data"}
 
 
 def _setting(name: str) -> Any:
-    """Return the option of a setting of the group data."""
+    """Return the option that overrides the setting ``data.NAME``, with its help and default."""
     row = _ROWS[name]
     return option(f"--{name}", help=f"{row.doc} (data.{name}, default {row.default})")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DataRequest:
-    """Where the data service listens, what it stores, and whom it trusts."""
+    """The options of rse-pf data: its listener, its store, its keys and its files."""
 
     host: str | None = _setting("host")
     port: int | None = _setting("port")
@@ -52,7 +52,7 @@ class DataRequest:
 
 
 def run_data(request: DataRequest, settings: PlatformSettings) -> int:
-    """Serve until a signal ends the process."""
+    """Run the data service until SIGINT or SIGTERM, or print its OpenAPI document; return the exit code."""
     if request.openapi:
         from rse_pf.data_server.routes import openapi_page
 

@@ -46,7 +46,7 @@ def _setting(name: str, flag: str = "") -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ServeRequest:
-    """Where a backend server listens, whom it trusts, and what it records and runs."""
+    """The options of rse-pf serve: listeners, keys, recordings and services of one backend server."""
 
     settings: Path | None = None
     host: str | None = _setting("serving.host")
@@ -106,13 +106,13 @@ class ServeRequest:
 
 
 _PLACEMENT = ("host", "port", "control_host", "control_port", "workers", "store", "live_host")
-"""Options that override the placement in the settings file."""
+"""Options that override a field of `ServerPlacement`, which is otherwise that of the settings file."""
 _SETTINGS = ("emulated_cores", "log_level")
-"""Options that override settings of the same name."""
+"""Options that override the setting of the same name in the group serving."""
 
 
 def run_server(request: ServeRequest, settings: PlatformSettings) -> int:
-    """Serve until a drain or a signal ends it."""
+    """Run one backend server until it is drained or stopped by a signal, and return its exit code."""
     services: dict[str, object] = {}
     if request.services is not None and request.follow_services is not None:
         raise UsageError("--services and --follow-services exclude each other", hint="leave one of them out")
@@ -154,6 +154,7 @@ def run_server(request: ServeRequest, settings: PlatformSettings) -> int:
 
 
 def _recorder(settings: PlatformSettings, server_id: str, key: Path | None) -> ServerRecorder | None:
+    """Return the recorder of this server; None if ``recording.folder`` is empty."""
     if not settings.recording.folder:
         return None
     from rse_pf.extensions.recording.server_recorder import FileServerRecorder
@@ -162,10 +163,16 @@ def _recorder(settings: PlatformSettings, server_id: str, key: Path | None) -> S
 
 
 def _given(request: ServeRequest, options: Iterable[str]) -> dict[str, object]:
+    """Return the values of those *options*, by name, that the command line gives."""
     return {name: getattr(request, name) for name in options if getattr(request, name) is not None}
 
 
 def _trust(keys: Path) -> TrustStore:
+    """Return the store of public keys, roster and deny list for the JWKS *keys*.
+
+    Raises:
+        UsageError: The file cannot be read.
+    """
     try:
         keys.open("rb").close()
     except OSError as error:

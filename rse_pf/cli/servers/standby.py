@@ -1,9 +1,9 @@
-"""A warm standby: it has imported what `rse-pf serve` needs, and becomes a server when it gets its arguments.
+"""Run a warm standby: a process that imports what `rse-pf serve` needs, and then waits to become a server.
 
-Started by the local platform as ``python -m rse_pf.cli.servers.standby``.  It imports in a thread of low
-priority, because servers work at the same time, and prints a line when it is warm.  One JSON line on its
-standard input holds the arguments and the log of the server; from then on it works at full priority.  It
-exits when that input ends without a line.
+The local platform starts it as ``python -m rse_pf.cli.servers.standby``.  It imports in a thread of low
+priority, because servers work at the same time, and prints a line when all is imported.  One JSON line on its
+standard input, with the arguments and the log of the server, makes it a server of full priority.  It exits if
+its standard input is closed before that.
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ _MODULES = (
     "numpy", "jwt", "cryptography.hazmat.primitives.asymmetric.ed25519", "uvloop", "picows",
     "prometheus_client", "rse_pf.cli.main", "rse_pf.cli.servers.serve", "rse_pf.server.supervisor",
 )  # fmt: skip
-"""In the order of their imports, so that the thread can stop between any two of them."""
+"""Modules that a server needs, in the order of their imports; the thread can stop between any two of them."""
+# Niceness of the thread that imports `_MODULES`: with one busy process on each core, it gets a third of a
+# core.
 _NICENESS = 3
-"""Of the thread that imports `_MODULES`: with one busy process on each core, it gets a third of a core."""
 
 
 def main() -> int:
-    """Import, wait for the arguments of a server, and run it; return its exit code."""
+    """Import in the background, wait for the arguments of a server, and run it; return its exit code.
+
+    Returns 0 if standard input is closed without arguments.
+    """
     ordered = threading.Event()
     importer = threading.Thread(target=_import_slowly, args=(ordered,), daemon=True)
     importer.start()
@@ -49,7 +53,10 @@ def main() -> int:
 
 
 def _import_slowly(ordered: threading.Event) -> None:
-    """Import until all is imported or the order has come.  Linux keeps a niceness for each thread."""
+    """Import `_MODULES` at low priority, and stop before the next one once *ordered* is set.
+
+    Linux keeps a niceness for each thread, so the rest of the process is not slowed down.
+    """
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
     for name in _MODULES:
         if ordered.is_set():

@@ -1,4 +1,4 @@
-"""The verb service: write, build, lock, replay, install and unblock services of your own.
+"""The verb service: create, build, lock, test, install, publish and unblock services of your own.
 
-How a service is run belongs to `rse_pf.services.custom`.
+Options and printed text belong here; how a service is run belongs to `rse_pf.services.custom`.
 """

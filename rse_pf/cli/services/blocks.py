@@ -1,7 +1,8 @@
-"""The actions status and unblock of the verb service: show and lift what servers refuse after crashes.
+"""Show and lift the refusals of services after crashes: rse-pf service status and service unblock.
 
-Every server decides by itself, so that each is asked on its control port: all servers of a local platform,
-or the one whose port is named.
+A server that refuses a service, or a request to it, to a robot, a tenant or all robots has a *block*.  Every
+server decides about its blocks by itself, so each is asked on its control port: all servers of a local
+platform, or the one whose port is named.
 """
 
 from __future__ import annotations
@@ -25,16 +26,18 @@ from rse_pf.terminal import show
 
 __all__ = ["Server", "ServersRequest", "UnblockRequest", "choose_servers", "show_blocks", "unblock"]
 
+# Time limit of the request to a server, in seconds.
 _TIMEOUT_S = 5.0
+# Host names of this machine that --url may have: control ports are on loopback.
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _COLUMNS = ("server", "service", "refused to", "because of", "for another")
 Server = tuple[str, int, str | None]
-"""What it is called, its control port, and the token of that port."""
+"""A backend server: its name, its control port, and the token of that port, None if it requires none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServersRequest:
-    """The servers that are asked: those of a local platform, or one by its control port."""
+    """The options that name the servers: those of a local platform, or one by its control port."""
 
     name: str = option("--name", default="default", help="name of the local platform (default: %(default)s)")
     control_port: int | None = option(
@@ -50,7 +53,7 @@ class ServersRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class UnblockRequest(ServersRequest):
-    """What is no longer refused: of a service, a tenant or a robot, or all of it."""
+    """The options that select the blocks that are lifted: by service, tenant and robot; without any, all."""
 
     service: str | None = option(nargs="?", metavar="SERVICE", help="only this service (default: all)")
     tenant: str | None = option(
@@ -60,7 +63,11 @@ class UnblockRequest(ServersRequest):
 
 
 def show_blocks(request: ServersRequest, settings: PlatformSettings) -> int:
-    """Show what is refused, to whom, and for how long; return 1 if a server did not answer."""
+    """Print each block: service, robot or tenant, cause and remaining time; return 1 if a server is silent.
+
+    Raises:
+        CommandFailed: No server answered, or one answered with an error.
+    """
     answers, silent = asyncio.run(_ask_all(choose_servers(request), "GET", "/blocks"))
     rows = [_row(server, block) for server, answer in answers for block in answer["blocks"]]
     left_out = sum(answer["count"] - len(answer["blocks"]) for _, answer in answers)
@@ -74,7 +81,11 @@ def show_blocks(request: ServersRequest, settings: PlatformSettings) -> int:
 
 
 def unblock(request: UnblockRequest, settings: PlatformSettings) -> int:
-    """Lift what is refused, and show what it was; return 1 if a server did not answer."""
+    """Lift the blocks that the options select, and print each; return 1 if a server did not answer.
+
+    Raises:
+        CommandFailed: No server answered, or one answered with an error.
+    """
     tenant = request.tenant or (DEFAULT_TENANT if request.robot else None)
     wanted = {"service": request.service, "tenant": tenant, "robot": request.robot}
     query = urlencode({name: value for name, value in wanted.items() if value})
@@ -96,7 +107,8 @@ def choose_servers(request: ServersRequest) -> list[Server]:
     """Return the servers that the options name: those of a platform, or one by its control port.
 
     Raises:
-        UsageError: There is none, the port or address is none, or a token file is refused.
+        UsageError: No server of the platform runs, the port or the address is not valid, or the token's file
+            cannot be read.
     """
     named = request.control_port if request.url is None else _port_of(request.url)
     if named is not None:
@@ -116,6 +128,7 @@ def choose_servers(request: ServersRequest) -> list[Server]:
 
 
 def _port_of(url: str) -> int:
+    """Return the port in *url*, an http address of this machine; raises UsageError for any other."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -132,7 +145,11 @@ def _port_of(url: str) -> int:
 async def _ask_all(
     servers: Sequence[Server], method: str, target: str
 ) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
-    """Return the name and answer of each server that answered, and the names of those that did not."""
+    """Send a request to each of *servers* at the same time.
+
+    Returns the name and the JSON answer of each server that answered, and the names of those that did not.  A
+    server whose workers answered only in part is in both.
+    """
     replies = await asyncio.gather(
         *(
             ControlPort(port, token).ask_once(target, timeout_s=_TIMEOUT_S, method=method)
@@ -152,6 +169,12 @@ async def _ask_all(
 
 
 def _document(name: str, reply: ControlPortReply) -> dict[str, Any] | None:
+    """Return the answer in *reply* of server *name*; None if it is incomplete.
+
+    Raises:
+        UsageError: The server requires a token.
+        CommandFailed: The server answered with another error.
+    """
     document = reply.document()
     if reply.status == 401:
         raise UsageError(f"{name} requires a token", hint="name the file of it with --control-token")
@@ -165,6 +188,11 @@ def _document(name: str, reply: ControlPortReply) -> dict[str, Any] | None:
 
 
 def _show_silent(silent: Sequence[str], answers: Sequence[Any]) -> int:
+    """Print the names of *silent* servers; return 1 if there are any, else 0.
+
+    Raises:
+        CommandFailed: No server answered.
+    """
     if not answers:
         raise CommandFailed(
             f"no answer from {', '.join(silent)}", hint="see rse-pf local status and the logs of the servers"
@@ -175,6 +203,7 @@ def _show_silent(silent: Sequence[str], answers: Sequence[Any]) -> int:
 
 
 def _row(server: str, block: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the cells of `_COLUMNS` for a block of *server*."""
     tenant, robot, requests = block["tenant"], block["robot"], block["requests"]
     whom = f"robot {tenant}/{robot}" if robot else f"tenant {tenant}" if tenant else "all robots"
     why = {

@@ -1,6 +1,7 @@
-"""The actions lock and build, and the step before test, run, install and debug: make a service ready to run.
+"""Lock the Python packages of a service, and build a service: rse-pf service lock and service build.
 
-C and C++ are compiled with cmake; Python packages of the service's own are installed once from its lock.
+The actions test, run, install and publish build a service first, too.  C and C++ are compiled with cmake; the
+Python packages in the service's lock are installed once.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ __all__ = ["FolderRequest", "build_service", "built_service", "changed_s", "lock
 
 @dataclass(frozen=True, kw_only=True)
 class FolderRequest:
-    """The folder of a service."""
+    """The argument that names the folder of a service."""
 
     folder: Path = option(metavar="FOLDER", help="folder of the service")
 
 
 def lock_service(request: FolderRequest, settings: PlatformSettings) -> None:
-    """Lock the packages of a service, and show what was chosen."""
+    """Write the lock of a service's Python packages, and print the chosen version of each."""
     source = request.folder
     _check_language(read_service(source))
     with at_work("resolving versions"):
@@ -50,7 +51,7 @@ def lock_service(request: FolderRequest, settings: PlatformSettings) -> None:
 
 
 def build_service(request: FolderRequest, settings: PlatformSettings) -> None:
-    """Build a service, and show its packages."""
+    """Build a service, and print the Python packages that were installed for it."""
     service, dependencies = built_service(request.folder)
     if dependencies is None:
         show(f"{service.name} has no packages of its own")
@@ -60,10 +61,10 @@ def build_service(request: FolderRequest, settings: PlatformSettings) -> None:
 
 
 def built_service(source: Path) -> tuple[InstalledService, Dependencies | None]:
-    """Return the service in *source*, ready to run, and its packages, None if it has none.
+    """Build the service in the folder *source*; return it and its Python packages, None if it has none.
 
     Raises:
-        UsageError: The folder or its lock is refused, or cmake is missing.
+        UsageError: The folder holds no valid service or lock, or cmake is not installed.
         CommandFailed: The compiler or pip failed.
     """
     service = read_service(source)
@@ -78,16 +79,23 @@ def built_service(source: Path) -> tuple[InstalledService, Dependencies | None]:
 
 
 def changed_s(folder: Path) -> float:
-    """Return when a file of a service was changed last, in Unix time; what is built does not count."""
+    """Return when a file in *folder*, of a service, was last changed, in Unix time.
+
+    Built files, recorded requests and bytecode of Python do not count.
+    """
     return max(_mtimes(folder))
 
 
 def _store() -> Path:
-    """Return where packages are installed; no platform can have this name."""
+    """Return the folder in which packages are installed, next to those of platforms.
+
+    No platform can have its name, which begins with a dot.
+    """
     return state_folder("default", os.environ).parent / ".dependencies"
 
 
 def _check_language(service: InstalledService) -> None:
+    """Raise UsageError if *service* is not in Python, the only language with a lock."""
     if service.language != "python":
         raise UsageError(
             f"{LOCK_FILE} is for services in Python, {service.name} is in {service.language}",
@@ -96,9 +104,13 @@ def _check_language(service: InstalledService) -> None:
 
 
 def _compile(folder: Path) -> None:
-    """Build a service that has a CMakeLists.txt and sources newer than its libraries.
+    """Compile the service in *folder* with cmake, if it has a CMakeLists.txt and is not up to date.
 
-    Its CMakeLists.txt may take the C interface of this version from the folder ``RSE_PF_INCLUDE``.
+    Its CMakeLists.txt finds the header of this version's C interface in the folder ``RSE_PF_INCLUDE``.
+
+    Raises:
+        UsageError: cmake is not installed.
+        CommandFailed: cmake failed; the end of its output is in the message.
     """
     if not (folder / "CMakeLists.txt").exists():
         return
@@ -120,6 +132,7 @@ def _compile(folder: Path) -> None:
 
 
 def _mtimes(folder: Path) -> Iterator[float]:
+    """Yield the time of the last change of each source file of a service, in Unix time."""
     for path in folder.rglob("*"):
         inside = path.relative_to(folder).parts
         if path.is_file() and inside[0] not in ("build", "requests") and "__pycache__" not in inside:

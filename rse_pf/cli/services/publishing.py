@@ -1,6 +1,7 @@
-"""The action publish: hand a service to all servers on AWS, list what they run, take one out.
+"""Publish a service to all servers on AWS, list the published services, or remove one: service publish.
 
-Servers look for changes every 15 seconds and load them while robots are connected; nothing is restarted.
+Servers read the list of published services every 15 seconds, and load changed ones while robots are
+connected; no server is restarted.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ __all__ = ["PublishRequest", "publish_service"]
 
 @dataclass(frozen=True, kw_only=True)
 class PublishRequest:
-    """The service that is published or removed, or a list of what is published."""
+    """The options of rse-pf service publish: the service that is published or removed, or the list."""
 
     service: str | None = option(
         nargs="?", metavar="FOLDER", help="folder of the service; with --remove its name"
@@ -43,7 +44,7 @@ class PublishRequest:
 
 
 def publish_service(request: PublishRequest, settings: PlatformSettings) -> int:
-    """Publish the service in a folder, remove one, or list them."""
+    """Publish the service in a folder, remove a published one, or list all; return 0."""
     if request.list and (request.remove or request.service is not None):
         raise UsageError("--list takes no service and no --remove", hint="rse-pf service publish --list")
     if request.json and not request.list:
@@ -73,6 +74,7 @@ def publish_service(request: PublishRequest, settings: PlatformSettings) -> int:
 
 
 def _list(store: ObjectStore, *, as_json: bool) -> int:
+    """Print the published services as lines or as JSON, and return 0."""
     services = read_list(store).services
     if as_json:
         show_json([_row(service) for service in services])

@@ -1,4 +1,4 @@
-"""The action test: replay requests in the sandbox of a server, and compare the answers with the expected."""
+"""Replay the recorded requests of a service in a sandbox, and compare the answers: rse-pf service test."""
 
 from __future__ import annotations
 
@@ -19,16 +19,27 @@ from rse_pf.terminal import counted, show
 __all__ = ["Recorded", "plain", "recorded_requests", "replay"]
 
 Recorded = Sequence[tuple[str, Mapping[str, Any]]]
-"""Name and content of each recorded request: ``request``, ``reply``, ``failure``, ``tolerance``."""
+"""File name and content of each recorded request.
 
+The content is a JSON object with ``request``, and the expected ``reply``, which may differ by ``tolerance``,
+or the code of the expected ``failure``.
+"""
+
+# Tolerance of numbers in a reply, relative and absolute, if a recorded request states none.
 _DEFAULT_TOLERANCE = 1e-9
+# Name that stands for the robot before lines that the service prints in a test.
 _DRY_RUN = "dry-run"
 _HINT = 'write {"request": {...}, "reply": {...}}'
+# Longest part of an unexpected reply that is printed, in characters.
 _MOST_LETTERS = 300
 
 
 def recorded_requests(source: Path) -> Recorded:
-    """Return the recorded requests of the service in *source*; raises UsageError if there are none."""
+    """Return the recorded requests ``requests/*.json`` of the service in the folder *source*, sorted by name.
+
+    Raises:
+        UsageError: There are none, or a file holds no request.
+    """
     requests: list[tuple[str, Mapping[str, Any]]] = []
     for path in sorted((source / "requests").glob("*.json")):
         requests.append((path.name, _read_request(path)))
@@ -40,12 +51,14 @@ def recorded_requests(source: Path) -> Recorded:
 
 
 def replay(service: InstalledService, recorded: Recorded, settings: PlatformSettings) -> int:
-    """Send *recorded* to *service* in one sandbox, show what became of each; return 1 if one is wrong.
+    """Send *recorded* to *service* in one sandbox, and print for each whether the answer is as expected.
+
+    Returns 1 if an answer is wrong, else 0.
 
     Args:
-        service: Built.
-        recorded: Sent one after the other, as one robot.
-        settings: Limits of the sandbox.
+        service: The service, after its build.
+        recorded: Requests, which are sent one after the other, as from one robot.
+        settings: Settings with the limits of the sandbox.
     """
     from rse_pf.server.sandbox.dry_run import dry_run
 
@@ -65,11 +78,12 @@ def replay(service: InstalledService, recorded: Recorded, settings: PlatformSett
 
 
 def plain(value: Any) -> Any:
-    """Return *value* as JSON gives it back: arrays are lists, and what JSON cannot hold is text."""
+    """Return *value* as it is after JSON: arrays become lists, and other objects their text."""
     return json.loads(json.dumps(value, default=lambda each: getattr(each, "tolist", each.__repr__)()))
 
 
 def _read_request(path: Path) -> dict[str, Any]:
+    """Return the content of a recorded request; raises UsageError if the file holds none."""
     found = read_document(path, "JSON", hint=_HINT)
     if not isinstance(found, dict) or "request" not in found:
         raise UsageError(f"{path} holds no request", hint=_HINT)
@@ -77,7 +91,10 @@ def _read_request(path: Path) -> dict[str, Any]:
 
 
 def _find_problem(expected: Mapping[str, Any], answer: Any) -> tuple[bool, str]:
-    """Return whether *answer* is wrong, and a description of it."""
+    """Return whether *answer* differs from the *expected* reply or failure, and words about it for the line.
+
+    A reply is right if the recorded request has neither ``reply`` nor ``failure``.
+    """
     from rse_pf.wire import Failure
 
     if isinstance(answer, Failure):
@@ -97,7 +114,10 @@ def _shorten(text: str) -> str:
 
 
 def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") -> str:
-    """Return the first difference of *got* from *expected*, "" if there is none."""
+    """Return the first difference of *got* from *expected* in words, "" if there is none.
+
+    Numbers may differ by *tolerance*, relative or absolute; *path* names the compared part in the words.
+    """
     if isinstance(expected, dict) and isinstance(got, dict):
         if set(got) != set(expected):
             return f"{path} has {', '.join(sorted(got))}, expected {', '.join(sorted(expected))}"

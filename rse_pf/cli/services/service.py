@@ -59,8 +59,11 @@ from rse_pf.terminal import error_lines, show, show_json, show_progress
 __all__ = ["ACTION"]
 
 _LANGUAGES = ("python", "cpp", "lua")
+# The text of a line of a server's log that holds a line which the service printed.
 _OUTPUT = re.compile(r"service-output robot=(?P<robot>\S+) text=(?P<text>.*) tenant=\S+")
+# Time between two checks of run for changed files and printed lines, in seconds.
 _POLL_S = 0.3
+# Fields of a recorded request; call sends only the field ``request`` of a file that has no others.
 _RECORDED_FIELDS = {"request", "reply", "tolerance", "failure"}
 
 
@@ -84,6 +87,7 @@ class _ListRequest:
     )
 
     def services_folder(self, settings: PlatformSettings) -> Path:
+        """Return the folder of installed services: --services, else the setting, else the local default."""
         if self.services is not None:
             return self.services
         if settings.services.folder:
@@ -108,11 +112,15 @@ class _CallRequest:
     name: str = option("--name", default="default", help="name of the local platform (default: %(default)s)")
 
 
-# --- new, install, list ---------------------------------------------------------------------------
+# --- the actions new, install, list and test ------------------------------------------------------
 
 
 def create(request: _NewRequest, settings: PlatformSettings) -> None:
-    """Create the folder of a new service that works."""
+    """Create a folder in the working folder with the template of a service, which works as it is.
+
+    Raises:
+        UsageError: The name is not valid, or the folder exists.
+    """
     name, language = request.name, request.lang
     if not NAME_PATTERN.fullmatch(name):
         raise UsageError(
@@ -139,7 +147,7 @@ def create(request: _NewRequest, settings: PlatformSettings) -> None:
 
 
 def install_service(request: _InstallRequest, settings: PlatformSettings) -> None:
-    """Copy a service to the installed ones."""
+    """Build a service, and copy it into the folder of installed services."""
     folder = request.services_folder(settings)
     built, dependencies = built_service(request.folder)
     service = install(built.folder, folder, dependencies)
@@ -150,7 +158,7 @@ def install_service(request: _InstallRequest, settings: PlatformSettings) -> Non
 
 
 def list_services(request: _ListRequest, settings: PlatformSettings) -> None:
-    """Show the services that are installed."""
+    """Print name, language, kind, digest and folder of each installed service."""
     for service in installed_services(request.services_folder(settings)):
         about = f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.identity[:12]}"
         show(f"{about}  {service.folder}")
@@ -161,17 +169,21 @@ def test(request: FolderRequest, settings: PlatformSettings) -> int:
     return replay(built_service(request.folder)[0], recorded_requests(request.folder), settings)
 
 
-# --- run, call --------------------------------------------------------------------------------------
+# --- the actions run and call ---------------------------------------------------------------------
 
 
 def run(request: _RunRequest, settings: PlatformSettings) -> int:
-    """Serve a service from a local platform, and load every saved change."""
+    """Serve a service from a platform in a temporary folder until Ctrl-C, and load every saved change.
+
+    The recorded requests are sent first; with --once the platform stops after them.  Returns 1 if, with
+    --once, a request failed unexpectedly, else 0.
+    """
     require("service")
     return asyncio.run(_run(request.folder, settings, once=request.once))
 
 
 def call(request: _CallRequest, settings: PlatformSettings) -> None:
-    """Send a request to a service of a running local platform, and print the reply."""
+    """Send a request to a service of a running local platform, and print the reply as JSON."""
     show_json(plain(asyncio.run(_call(request.service, request.request, request.name, settings))))
 
 
@@ -210,12 +222,12 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
                             changed_at_s = newest
                             await _reload(platform, source, place / "services", recorded, settings)
         finally:
-            _show_output(output)  # what the servers wrote until they ended
+            _show_output(output)  # lines that the service printed until its server stopped
     return 0
 
 
 def _show_output(output: LogFollower) -> None:
-    """Show what the service has printed since the last call."""
+    """Print the lines that the service has printed since the last call."""
     for line in output.new_lines():
         line_text = _format_line(line)
         if line_text:
@@ -223,6 +235,7 @@ def _show_output(output: LogFollower) -> None:
 
 
 def _format_line(line: LogLine) -> str:
+    """Return *line* for the terminal if it holds a line that the service printed, else ""."""
     printed = _OUTPUT.fullmatch(line.text)
     if printed is None:
         return ""
@@ -240,15 +253,15 @@ async def _reload(
         service = install(built.folder, services, dependencies)
         await platform.roll()
         await _ask_recorded(platform, service, recorded, settings)
-    except RsePfError as error:  # the author corrects it and saves again
+    except RsePfError as error:  # shown only, so that the author can correct the source and save again
         show(*error_lines(error))
 
 
 async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, settings: PlatformSettings) -> bool:
-    """Send every recorded request as a robot; return whether all were answered as expected.
+    """Send every recorded request as a robot, and print the answers; return whether none failed unexpectedly.
 
-    Robots do not get the reason of a failure.  To show it to the author, the first failed request is repeated
-    in a dry run.
+    Replies are not compared.  Robots do not get the reason of a failure: to show it to the author, the first
+    request that failed unexpectedly is repeated in a dry run, a sandbox without a server.
     """
     from client_sdk import connect
     from rse_pf.server.sandbox.dry_run import dry_run
@@ -288,6 +301,11 @@ async def _call(name: str, request: str, platform: str, settings: PlatformSettin
 
 
 def _payload(text: str) -> Any:
+    """Return the request in *text*, JSON or ``@FILE``; of a recorded request its field ``request``.
+
+    Raises:
+        UsageError: The text or the file is not JSON.
+    """
     hint = "write --request '{\"points\": [0, 0, 1]}'"
     if text.startswith("@"):
         payload = read_document(Path(text[1:]), "JSON", hint=hint)
