@@ -78,7 +78,15 @@ _MODULES = {
 }
 """Module of each verb, by name, so that only the module of the verb that runs is imported."""
 
-_EXIT_OK, _EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED, _EXIT_PIPE = 0, 1, 2, 130, 141
+_EXIT_OK = 0
+_EXIT_FAILED = 1
+# Exit code of a wrong call or wrong settings.
+_EXIT_USAGE = 2
+# Exit code after Ctrl-C: 128 and the number of SIGINT, as shells have it.
+_EXIT_INTERRUPTED = 130
+# Exit code if the program that reads standard output has exited: 128 and the number of SIGPIPE.
+_EXIT_PIPE = 141
+# Message of a SettingsError about a value out of bounds, with the name of the setting.
 _REFUSED = re.compile(r"[a-z]+\.(?P<name>[a-z_]+) = .* is (below|above|not one of) ")
 
 

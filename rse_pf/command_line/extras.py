@@ -31,7 +31,7 @@ class Extra:
 
 
 def _same(*names: str) -> dict[str, str]:
-    """Return module to package for modules that have the name of their package."""
+    """Return a mapping of each name to itself, for modules that have the name of their package."""
     return {name: name for name in names}
 
 
@@ -143,7 +143,7 @@ _OPTIONAL = {"h5py", "yaml"}
 
 
 def modules_of(extra: str) -> dict[str, str]:
-    """Return module to package of *extra* and of all extras that it includes, without optional modules."""
+    """Return the package of each module in *extra* and the extras that it includes, except optional ones."""
     modules = {
         module: package for name in EXTRAS[extra].includes for module, package in modules_of(name).items()
     }

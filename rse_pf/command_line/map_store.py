@@ -43,7 +43,9 @@ _IN_MEMORY = "memory:"
 _FOLDER = "dir:"
 # Folder in a platform's state folder that is the store of a platform with the setting ``memory:``.
 _OBJECTS = "objects"
+# A valid name of a map.
 _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+# Characters of a folder's name that a map's name may not have; each run of them becomes a hyphen.
 _NO_NAME = re.compile(r"[^a-z0-9]+")
 
 

@@ -29,7 +29,9 @@ _CONVERTERS: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Pat
 
 A type that is missing here, such as ``str``, leaves the text as it is.
 """
+# The words that request a help page, if they come first.
 _HELP = (["-h"], ["--help"])
+# Message of argparse about a value that is not among the choices.
 _CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known>.*)\)")
 
 

@@ -42,9 +42,8 @@ def find_defect(module: str, package: str) -> Defect | None:
     if importlib.util.find_spec(module) is None:
         return Defect(problem=f"{module} cannot be imported")
     installed = {name: metadata.version(name) for name in _owners_of().get(module, ())}
-    with contextlib.suppress(
-        metadata.PackageNotFoundError
-    ):  # Python 3.10 knows some owners by their name only
+    # Python 3.10 does not list every package with its modules: look this one up by its name, too.
+    with contextlib.suppress(metadata.PackageNotFoundError):
         installed[package] = metadata.version(package)
     named = [f"{name} {version}" for name, version in sorted(installed.items())]
     others = sorted(installed.keys() - {package})

@@ -37,6 +37,7 @@ _FULL_BYTES = 1 << 20
 # A disk leaves the level low or full once its free space is this many times the level's threshold, so that
 # the level does not alternate.
 _HYSTERESIS = 1.1
+# Prefix of the location of an object store that is a folder.
 _DIRECTORY = "dir:"
 _MIB = 1 << 20
 

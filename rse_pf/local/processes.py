@@ -213,7 +213,7 @@ class ServerProcess:
         self._log_from = 0
 
     def prepare(self) -> None:
-        """Remove the announcement of the process before, and count lines of the log from its present end."""
+        """Remove the announcement of an earlier process; from now on read only new lines of the log."""
         self.announcement.unlink(missing_ok=True)
         self._log_from = log_size(self.log)
 

@@ -36,10 +36,13 @@ __all__ = [
     "stop_platform",
 ]
 
+# Name of the state file in a platform's folder.
 _FILE = "platform.json"
+# Name of the file in that folder whose lock the control plane holds.
 _LOCK = "lock"
 _OPTIONAL = ("lan", "authority_file", "rosbridge_server")
 """Fields of `PlatformState` that the file has only if they are set: earlier versions refuse new fields."""
+# A valid name of a platform.
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 
 
@@ -82,7 +85,7 @@ class PlatformState:
     authority_file: str = ""
 
     def processes(self) -> tuple[ProcessMark, ...]:
-        """Return all processes of the platform except for the control plane."""
+        """Return the marks of all processes of the platform except for the control plane."""
         balancer = () if self.load_balancer is None else (self.load_balancer,)
         return (*(server.process for server in (*self.servers, *self.single_servers)), *balancer)
 

@@ -193,7 +193,7 @@ def remove(request: RobotRequest, settings: PlatformSettings) -> None:
     access = request.open_access_control(settings)
     tenant = _enrolled_tenant(request, access)
     enrolled = access.roster().find(tenant, request.robot)
-    if enrolled is None:  # another operator has just removed it
+    if enrolled is None:  # another operator has just removed the robot
         raise UsageError(f"robot {request.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
 
     def without(roster: Roster) -> Roster:

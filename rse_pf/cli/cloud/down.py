@@ -95,7 +95,7 @@ def _prove(account: Account, names: ResourceNames, costs: changing.DeploymentCos
 
 
 def _last_proof(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
-    """Return the resources that exist once AWS lists none as left over, or after `_LISTED_LATE_S`."""
+    """Return the resources that remain, once AWS lists none as left over or after `_LISTED_LATE_S`."""
     deadline = time.monotonic() + _LISTED_LATE_S
     while True:
         proof = _prove(account, names, costs)

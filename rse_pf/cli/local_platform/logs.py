@@ -50,7 +50,9 @@ _HEAD = ("time", "level", "event", "traceback")
 # Beginnings of the names of events that backend servers report in their logs; all others are the control
 # plane's.
 _OF_SERVERS = ("robot-", "live-")
+# An age such as 90s, 5m, 2h or 1.5d.
 _AGE = re.compile(r"(?P<count>\d{1,9}(\.\d{1,9})?)(?P<unit>[smhd])")
+# Length in seconds of each unit of an age.
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 

@@ -411,7 +411,7 @@ async def _drive(
     from client_sdk.plugins import load_features
 
     stop = asyncio.Event()
-    with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # not in the main thread
+    with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # signals need the main thread
         asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
     async with _robot(request, settings) as robot:
         mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(request.features),

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LocaliseRequest", "run_localise"]
 
+# RECORDING:ROW or RECORDING:FIRST-LAST.
 _FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
 # Largest image file that is read and sent to a platform, in bytes: it protects the memory of this process;
 # the platform has a limit of its own.

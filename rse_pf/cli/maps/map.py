@@ -117,7 +117,7 @@ def _check_folder(file: Path) -> None:
 
 
 def _list(request: StoreRequest, settings: PlatformSettings) -> None:
-    """Print the head of each map of the tenant."""
+    """Print the head, the current version, of each map of the tenant."""
     maps = request.open_maps(settings)
     heads = {name: maps.head(name) for name in maps.names()}
     request.print(

@@ -171,7 +171,7 @@ class EnvoyLoadBalancer:
             raise self.process.failed(late if self.process.is_running() else self.process.ending())
 
     def set_targets(self, targets: Sequence[Target], cluster: str = CLUSTER) -> None:
-        """Send new connections of *cluster* to *targets* only; open connections stay where they are."""
+        """Send new connections of *cluster*, one of Envoy's clusters, to *targets* only; open ones stay."""
         self._write(self._endpoints[cluster], json.dumps(endpoints(targets, cluster)))
 
     async def stats(self) -> Mapping[str, TargetStats]:

@@ -125,7 +125,7 @@ class ControlPlane:
         self._cores = len(os.sched_getaffinity(0))
 
     def start_checks(self) -> None:
-        """Check the health of every server from its announcement on, unless neither loop is wanted."""
+        """Check the health of every server from its announcement on, if elastic or with ``on_sample``."""
         if self._is_idle:
             return
         self._fleet.on_ready = lambda member: self._fleet.keep(self._check_periodically(member))
@@ -146,7 +146,7 @@ class ControlPlane:
             self._act_soon()
 
     async def _keep_standby(self) -> None:
-        """Start a warm standby whenever there is none and no server has started lately."""
+        """Start a warm standby whenever there is none and no server became healthy in the last 3 s."""
         while self._elastic:
             await asyncio.sleep(_STANDBY_EVERY_S)
             self._fleet.start_standby()
@@ -156,11 +156,11 @@ class ControlPlane:
         self._elastic = False
 
     def retry_replacements(self) -> None:
-        """Decide again soon: replacements may have waited for space on a full disk."""
+        """Run the scale modifier again soon: replacements may have waited for space on a full disk."""
         self._act_soon()
 
     def watch_spread(self) -> None:
-        """Watch for 30 s whether robots are spread evenly over the servers; nothing without rebalancing."""
+        """For 30 s, ask robots of crowded servers to move; do nothing unless rebalancing is on."""
         if self._rebalancer is not None:
             self._rebalancer.watch(time.monotonic())
 

@@ -16,7 +16,9 @@ from rse_pf.local.state import ServerState
 __all__ = ["federate_pages", "service_discovery"]
 
 _LOOPBACK = "127.0.0.1"
+# Label of every metric with the name of its server.
 _LABEL = "server"
+# Label of the metrics about disks with the folder on that disk.
 _FOLDER = "folder"
 
 

@@ -294,7 +294,7 @@ class Fleet:
     # --- launches, drains and replacements that the scale modifier and operations decide ----------
 
     def standing(self, now_s: float) -> ServerHealth:
-        """Return numbers and names of the servers at *now_s* (monotonic), as the scaling policy counts."""
+        """Return the numbers of servers in each state at *now_s* (monotonic), for the scaling policy."""
         there = [member for member in self.members.values() if not member.leaving and not member.out]
         return ServerHealth(
             servers=len(there) + len(self.dead),

@@ -50,7 +50,7 @@ class OperatedPlatform(Protocol):
         """Have server *name* move its robots and exit; return the report of the drain."""
 
     def check_roll(self, settings: PlatformSettings) -> SettingsChange:
-        """Return what a roll with *settings* changes; raises UsageError if it can change nothing of it."""
+        """Return what a roll with *settings* changes; raises UsageError for changes that it cannot make."""
 
     async def roll(self, change: SettingsChange | None = None) -> None:
         """Replace every server by a new one, which has the settings of *change* if it is given."""

@@ -418,7 +418,7 @@ class LocalPlatform:
         self.settings = settings
 
     async def _replace_servers(self) -> None:
-        """Replace the servers of now one by one, while the scale modifier does not change their number."""
+        """Replace the present servers one by one, while the scale modifier does not change their number."""
         self._control.hold = True
         try:
             # Servers that are still starting are replaced, too: they may have read the former settings.
@@ -601,7 +601,7 @@ class LocalPlatform:
             )
 
     async def _settings_digest(self, server: ServerState) -> str | None:
-        """Return the digest of the settings that *server* runs with; None if it does not name one."""
+        """Return the digest of the settings that *server* runs with; None if it does not answer."""
         if not server.port:
             return None
         port = self.backend_servers.control(server.control_port)
@@ -735,7 +735,7 @@ class LocalPlatform:
         self._loop.call_soon_threadsafe(self._report_unwritten_state, problem)
 
     def _emit(self, event: str, **details: Any) -> None:
-        """Pass an event to the list, the audit log, the recorder, the operator's port and the callback."""
+        """Append an event to ``events``; pass it to audit log, recorder, operator's port and callback."""
         entry = {"event": event, **details}
         self.events.append(entry)
         self._audit.record(entry)
@@ -748,7 +748,7 @@ class LocalPlatform:
 def _with_sample_observer(
     options: ControlOptions, observe: Callable[[Mapping[str, Any]], None]
 ) -> ControlOptions:
-    """Return *options* whose ``on_sample`` calls *observe* with each sample, then the callback of before."""
+    """Return *options* whose ``on_sample`` calls *observe* with each sample, then the previous callback."""
     before = options.on_sample
 
     def observe_both(sample: Mapping[str, Any]) -> None:

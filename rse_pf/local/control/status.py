@@ -123,7 +123,7 @@ def _disks(folder: Path) -> list[DiskSpace]:
 
 
 async def _single_server(server: ServerState, ready: str) -> dict[str, Any]:
-    """Return the state of the data or rosbridge server; it is ready if its path *ready* answers 200."""
+    """Return name, pid, port and state of the data or rosbridge server, ready if path *ready* answers 200."""
     row: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
     silent = _state_without_answer(server.process, server.port)
     if silent is not None:

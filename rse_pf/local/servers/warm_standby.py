@@ -66,7 +66,7 @@ class WarmStandby:
         return True
 
     async def wait_warm(self, timeout_s: float) -> None:
-        """Start a standby unless there is one, and wait until it is warm, at most *timeout_s*."""
+        """Start a standby unless there is one, and wait until it is warm, but not longer than *timeout_s*."""
         end = time.monotonic() + timeout_s
         self.warm()
         while self._program and not self.is_warm and time.monotonic() < end:
