@@ -72,7 +72,7 @@ def check_listener(host: str, port: int, *, is_protected: bool = False) -> None:
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise ConfigurationError(
-                    f"{host} is no address of this machine", hint="ip address shows them"
+                    f"{host} is no address of this machine", hint="ip address shows those that it has"
                 ) from error
             raise ConfigurationError(
                 f"cannot listen on {host}:{port}: {error.strerror}",

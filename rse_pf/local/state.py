@@ -257,7 +257,7 @@ def stop_platform(folder: Path, timeout_s: float = STOP_TIMEOUT_S) -> bool:
 
 def _state(document: Any) -> PlatformState:
     if not isinstance(document, dict):
-        raise TypeError("it is not an object")
+        raise TypeError("it holds no JSON object")
     balancer = document.pop("load_balancer")
     servers = tuple(map(_server, document.pop("servers")))
     data, rosbridge = document.pop("data_server", None), document.pop("rosbridge_server", None)

@@ -100,7 +100,7 @@ def _thumbprint(key_id: str) -> str:
     if key_id and not _THUMBPRINT.fullmatch(thumbprint):
         raise UsageError(
             f"{key_id[:80]!r} is not the id of a robot's key",
-            hint="rse-pf audit show names removed ones",
+            hint="rse-pf audit show names the keys of earlier enrolments",
         )
     return thumbprint
 

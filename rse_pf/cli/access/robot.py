@@ -272,7 +272,7 @@ def set_quota(request: _QuotaRequest, settings: PlatformSettings) -> None:
     access.change_roster(changed)
     limit = f"{quotas['data_bytes']:.0f} bytes" if quotas else "what data.quota_bytes says"
     request.record("robot.quota", request.robot, tenant=tenant, limit=limit)
-    show(f"{described(request.robot, tenant)} may store {limit}; all servers know it within 2 s")
+    show(f"{described(request.robot, tenant)} may store {limit}; all servers apply it within 2 s")
 
 
 def list_robots(request: _ListRequest, settings: PlatformSettings) -> None:

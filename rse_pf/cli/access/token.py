@@ -145,7 +145,8 @@ def revoke(request: _RevokeRequest, settings: PlatformSettings) -> None:
         raise UsageError("--not-enrolled is for --all-of", hint="see rse-pf token revoke --help")
     if request.token is None or request.all_of is not None:
         raise UsageError(
-            "rse-pf token revoke needs a token, or --all-of ROBOT", hint="a token or - comes last"
+            "rse-pf token revoke needs a token, or --all-of ROBOT",
+            hint="the token, or - for standard input, comes last",
         )
     _revoke_token(request, request.token, settings)
 

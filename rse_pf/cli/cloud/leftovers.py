@@ -30,11 +30,11 @@ def show_leftovers(request: NoOptions, settings: PlatformSettings) -> int:
         show_error(error)
         return _FAILED
     if stacks:
-        show(f"these stacks stand, and what they own is not listed: {', '.join(stacks)}")
+        show(f"these stacks exist, and their resources are not listed: {', '.join(stacks)}")
     for leftover in leftovers:
         show(f"{leftover.kind}  {leftover.name}", f"  {leftover.why}", f"  remove: {leftover.remove}")
     unread = sum(leftover.unread for leftover in leftovers)
-    show(f"{len(leftovers) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
+    show(f"{len(leftovers) - unread} left over" + (f", {unread} could not be read" if unread else ""))
     return 1 if leftovers else 0
 
 

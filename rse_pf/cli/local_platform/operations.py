@@ -43,7 +43,7 @@ def operate(
     if not is_alive(state.control_plane) or not state.status_port:
         raise UsageError(
             f"the control plane of platform {state.name!r} does not run",
-            hint=f"start it, it takes over what runs: rse-pf local --name {state.name}",
+            hint=f"start one, which takes over the servers that run: rse-pf local --name {state.name}",
         )
     port = ControlPort(state.status_port, read_control_token(Path(state.control_token_file)))
     last: Mapping[str, Any] = {}

@@ -88,7 +88,7 @@ def _restore(request: RestoreRequest, settings: PlatformSettings, backup: Checke
     if content.tenant != request.tenant:
         raise UsageError(
             f"this is a backup of tenant {content.tenant!r}, and not of {request.tenant!r}",
-            hint=f"--tenant {content.tenant}",
+            hint=f"restore it with --tenant {content.tenant}",
         )
     store = open_data_store(settings)
     account = TenantAccount(store, request.tenant, settings.data)

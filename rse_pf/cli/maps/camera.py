@@ -252,7 +252,8 @@ def _raw_pairs(sources: Sequence[str]) -> Iterator[tuple[npt.NDArray[np.uint8], 
     """
     if len(sources) > 2:
         raise UsageError(
-            f"{len(sources)} sources of a pair", hint="name two devices, videos or folders, or one of both"
+            f"--stereo takes 1 or 2 sources, not {len(sources)}",
+            hint="name two devices, videos or folders, or one whose images show both cameras",
         )
     folder = Path(sources[0])
     if len(sources) == 1 and (folder / "left").is_dir() and (folder / "right").is_dir():

@@ -453,7 +453,9 @@ async def _robot(request: DriveRequest, settings: PlatformSettings) -> AsyncIter
         try:
             token = request.token_file.read_text(encoding="ascii").strip()
         except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"cannot read the token in {request.token_file}", hint="rse-pf token") from error
+            raise UsageError(
+                f"cannot read the token in {request.token_file}", hint="rse-pf token issue NAME > FILE"
+            ) from error
         async with connect(list(request.url), token=token, settings=settings.session) as robot:
             yield robot
     else:

@@ -191,14 +191,16 @@ def _client(request: LocaliseRequest) -> DataClient:
     try:
         token = request.token_file.read_text(encoding="ascii").strip()
     except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read the token in {request.token_file}", hint="rse-pf token") from error
+        raise UsageError(
+            f"cannot read the token in {request.token_file}", hint="rse-pf token issue NAME > FILE"
+        ) from error
     trusted = None
     if request.authority is not None:
         try:
             trusted = ssl.create_default_context(cafile=str(request.authority))
         except OSError as error:
             raise UsageError(
-                f"{request.authority} is not a certificate", hint="name authority.crt"
+                f"{request.authority} is not a certificate", hint="name the platform's file authority.crt"
             ) from error
     return DataClient(request.url, token, DataOptions(ssl_context=trusted))
 
@@ -319,7 +321,7 @@ def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Ca
             return keyframe.camera
     raise UsageError(
         f"{label} is {width}x{height} px, and no camera of the map has that size",
-        hint="name it: --camera fx,fy,cx,cy",
+        hint="name the camera of the image: --camera fx,fy,cx,cy",
     )
 
 

@@ -177,7 +177,7 @@ def _document(name: str, reply: ControlPortReply) -> dict[str, Any] | None:
     """
     document = reply.document()
     if reply.status == 401:
-        raise UsageError(f"{name} requires a token", hint="name the file of it with --control-token")
+        raise UsageError(f"{name} requires a token", hint="name the file of the token with --control-token")
     if reply.status == 404:
         raise CommandFailed(f"{name} is of an earlier version", hint="roll the servers to this version")
     if reply.status != 200:

@@ -259,7 +259,9 @@ class LocalPlatform:
             UsageError: The platform has not started, or *robot* is not a valid name.
         """
         if self._key is None:
-            raise UsageError("the platform has not started", hint="enter it with async with")
+            raise UsageError(
+                "the platform has not started", hint="write: async with LocalPlatform(...) as platform"
+            )
         return self._key.issue(
             robot,
             now=time.time(),
