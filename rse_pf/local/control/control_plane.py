@@ -50,8 +50,8 @@ _MOVE_TIMEOUT_S = 2.0
 # Time limit of reading a server's /status page, as a share of the time between two samples: a slow server
 # must not delay the next sample.
 _STATUS_SHARE = 0.5
-# A health check that fails later than 1 + this many times its time limit was delayed by the control plane
-# itself.
+# A failed health check that took more than (1 + this) times its time limit was delayed by the control plane
+# itself, and does not count.
 _LATE_SHARE = 0.5
 # States in which a server answers /readyz with a failure because it drains, and not because it is unhealthy.
 _LEAVING = frozenset({"draining", "leaving"})
