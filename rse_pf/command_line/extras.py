@@ -175,7 +175,7 @@ def extra_of_module(module: str) -> MissingExtra | None:
 
 
 def _missing_extras(module: str) -> Iterator[MissingExtra]:
-    """Yield an error for each extra that has *module*."""
+    """Yield the error MissingExtra for each extra that installs *module*."""
     for name, extra in EXTRAS.items():
         if module in extra.modules:
             yield MissingExtra(extra.modules[module], name)

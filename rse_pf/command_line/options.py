@@ -81,7 +81,7 @@ def option(*flags: str, default: Any = None, section: str = "", exclusive: str =
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises UsageError where `argparse.ArgumentParser` prints an error and exits."""
+    """A parser of words that raises UsageError where `argparse.ArgumentParser` prints an error and exits."""
 
     typed: Sequence[str] = ()
     """The words that are parsed now, for the hints of `error`."""

@@ -161,7 +161,7 @@ def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
     try:
         access.change_roster(lambda roster: roster.enrolled(robot))
     except BaseException:
-        if request.out is not None:  # the platform does not know the key in this file
+        if request.out is not None:  # remove the file: the platform does not know its key
             request.out.unlink(missing_ok=True)
         raise
     allowed = " ".join(robot.scopes) or "everything"

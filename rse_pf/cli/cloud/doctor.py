@@ -85,9 +85,9 @@ def _node() -> Finding:
 
 
 def _cli(checkout: Path) -> Finding:
-    """Return whether the CDK's command line can read the assembly schema that the CDK's library writes.
+    """Check that the CDK's command line can read the assembly schema that the CDK's library writes.
 
-    A warning if it can, but is not the version that package.json pins.
+    Returns a failure if it cannot, or is not installed, and a warning if package.json pins another version.
     """
     fix = "make setup installs the one in package-lock.json; never npm install aws-cdk"
     try:

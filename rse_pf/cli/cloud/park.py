@@ -14,7 +14,7 @@ __all__ = ["ACTION"]
 
 @dataclass(frozen=True, kw_only=True)
 class ParkRequest(changing.ChangeRequest):
-    """The options of rse-pf cloud park."""
+    """The options of rse-pf cloud park: whether the load balancer is destroyed, too."""
 
     deep: bool = option(
         "--deep",

@@ -258,7 +258,9 @@ def stop(request: PlatformRequest, settings: PlatformSettings) -> None:
 
 
 def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSettings:
-    """Return *settings* whose servers name robots the burst function at *port* on loopback.
+    """Return *settings* with the address, at *port* on loopback, of the burst function.
+
+    Servers announce that address to robots, which call the function while no server answers in time.
 
     Raises:
         UsageError: *lan* is not empty, or *port* is no port.

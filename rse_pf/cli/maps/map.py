@@ -227,7 +227,7 @@ def _rollback(request: _RollbackRequest, settings: PlatformSettings) -> None:
 
 
 def _prune(request: _PruneRequest, settings: PlatformSettings) -> None:
-    """Remove all versions of a map but the head and the --keep newest ones, and print them."""
+    """Remove the versions of a map, except for the head and the --keep newest, and print what was removed."""
     if request.keep < 1:
         raise UsageError(f"--keep {request.keep} is below 1", hint="1 keeps the head and the newest version")
     maps = request.open_maps(settings)

@@ -486,7 +486,7 @@ class Fleet:
         self.on_lost()
 
     def _set_targets(self) -> None:
-        """Write the serving servers as targets of the balancer, unless adopted targets are not up yet."""
+        """Make the serving servers the balancer's targets, but not before all adopted targets are up."""
         if not self._still_targets:
             self._load_balancer.set_targets([server.target for server in self.serving])
         self._changed()

@@ -182,7 +182,7 @@ class OperatorPort:
     def _act_at_once(
         self, act: Callable[[str], None], query: Mapping[str, str]
     ) -> AsyncGenerator[Event, None]:
-        """Apply *act* to the server of the request, and return the event that it is done."""
+        """Call *act*, such as kill, with the server that the request names; return the event of success."""
         act(query.get("server", ""))
         return _yield_over()
 

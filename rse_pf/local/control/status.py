@@ -93,7 +93,7 @@ def status_table(status: Mapping[str, Any]) -> str:
     for server in status["servers"]:
         for tenant, taken_s in server.get("tenant_cpu_s", {}).items():
             taken[tenant] += taken_s
-    if len(taken) > 1:  # the time of a single tenant says nothing that the servers' rows do not
+    if len(taken) > 1:  # with one tenant, its CPU time is that of all servers
         most = sorted(taken, key=taken.__getitem__, reverse=True)[:_MAX_TENANTS]
         shown = ", ".join(f"{tenant} {taken[tenant]:.1f} s" for tenant in most)
         lines.append(f"computed for tenants  {shown}")
