@@ -38,7 +38,7 @@ __all__ = [
 
 # Name of the state file in a platform's folder.
 _FILE = "platform.json"
-# Name of the file in that folder whose lock the control plane holds.
+# Name of the file in a platform's folder whose lock the control plane holds.
 _LOCK = "lock"
 _OPTIONAL = ("lan", "authority_file", "rosbridge_server")
 """Fields of `PlatformState` that the file has only if they are set: earlier versions refuse new fields."""

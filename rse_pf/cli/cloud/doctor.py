@@ -29,9 +29,9 @@ _OLDEST_NODE = 22
 _NODE_TIMEOUT_S = 10.0
 # File of the installed command line of the CDK, in the checkout.
 _CLI = Path("node_modules", "aws-cdk", "package.json")
-# File of the checkout that pins the version of that command line.
+# File of the checkout that pins the version of the CDK's command line.
 _PINNED = Path("package.json")
-# npm package whose version is that of the assembly (the CDK's output) that the command line can read.
+# npm package whose version is that of the assembly (the CDK's output) that the CDK's command line can read.
 _SCHEMA = "@aws-cdk/cloud-assembly-schema"
 
 

@@ -20,7 +20,7 @@ __all__ = ["ACTION"]
 
 # Longest wait until the tagging service of AWS no longer lists resources that were deleted, in seconds.
 _LISTED_LATE_S = 60.0
-# Time between two readings of that list, in seconds.
+# Time between two readings of the resources that still exist, in seconds.
 _POLL_S = 5.0
 
 

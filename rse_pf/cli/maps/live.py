@@ -31,7 +31,8 @@ __all__ = ["LIVE_ACTIONS", "run_publish"]
 
 # Time limit of a request to a map server, in seconds.
 _DEADLINE_S = 30.0
-# Time limit of that request in ``show``, in seconds; then the map is read from the store.
+# Time limit of a request to a map server in rse-pf map live show, in seconds; then the state is read from the
+# store.
 _SHOW_DEADLINE_S = 3.0
 
 

@@ -53,7 +53,7 @@ class ServersRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class UnblockRequest(ServersRequest):
-    """The options that select the blocks that are lifted: by service, tenant and robot; without any, all."""
+    """The options that select refusals of services to lift: by service, tenant and robot; none means all."""
 
     service: str | None = option(nargs="?", metavar="SERVICE", help="only this service (default: all)")
     tenant: str | None = option(
@@ -63,7 +63,7 @@ class UnblockRequest(ServersRequest):
 
 
 def show_blocks(request: ServersRequest, settings: PlatformSettings) -> int:
-    """Print each block: service, robot or tenant, cause and remaining time; return 1 if a server is silent.
+    """Print each refusal: service, robot or tenant, cause, time left; return 1 if a server did not answer.
 
     Raises:
         CommandFailed: No server answered, or one answered with an error.
@@ -81,7 +81,7 @@ def show_blocks(request: ServersRequest, settings: PlatformSettings) -> int:
 
 
 def unblock(request: UnblockRequest, settings: PlatformSettings) -> int:
-    """Lift the blocks that the options select, and print each; return 1 if a server did not answer.
+    """Lift the refusals that the options select, and print each; return 1 if a server did not answer.
 
     Raises:
         CommandFailed: No server answered, or one answered with an error.

@@ -33,9 +33,10 @@ _DRAIN_REQUEST_S = 2.0
 # Longest wait until the load balancer finds a new server healthy, in seconds; then it is looked at again
 # whether that server has exited or leaves, and the wait begins again.
 _HEALTHY_WAIT_S = 0.5
-# Pause between two such waits for the load balancer, in seconds, which may itself be restarting.
+# Pause between two waits until the load balancer finds a new server healthy, in seconds: while the load
+# balancer is being restarted, a wait returns at once.
 _PAUSE_S = 0.02
-# Time after which tasks that still run are cancelled again, in seconds.
+# When the fleet is closed, background tasks that still run after this time are cancelled again, in seconds.
 _CANCEL_AGAIN_S = 0.2
 # A warm standby starts once every server has been healthy for this long, in seconds, so that its imports do
 # not delay the start of a server.

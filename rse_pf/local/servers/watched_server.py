@@ -23,13 +23,14 @@ __all__ = ["CHECK_S", "NICENESS", "WatchedServer"]
 
 # Time between two health checks of the server, and time limit of a check, in seconds.
 CHECK_S = 1.0
-# First pause between two failed starts, in seconds; each next one is twice as long.
+# Pause after the first failed start of a replacement, in seconds; each further pause is twice as long.
 _FIRST_PAUSE_S = 0.1
-# Longest pause between two failed starts, in seconds.
+# Longest pause after a failed start of a replacement, in seconds.
 _MAX_PAUSE_S = 5.0
 # Time between two checks whether a full disk has space again, in seconds.
 _WAIT_FOR_SPACE_S = 0.5
-# Niceness of these servers: backend servers, which compute poses, get the CPU time of a busy machine first.
+# Niceness of the data server and the rosbridge server: on a busy machine, backend servers, which compute
+# poses, get CPU time first.
 NICENESS = 10
 
 
