@@ -48,7 +48,7 @@ def check_lan_address(text: str) -> str:
     try:
         address = ipaddress.ip_address(text)
     except ValueError as error:
-        raise UsageError(f"--lan {text[:80]} is not an IP address", hint=_EXAMPLE) from error
+        raise UsageError(f"--lan {text[:80]} is not an address of IPv4 or IPv6", hint=_EXAMPLE) from error
     if address.is_loopback or address.is_unspecified or address.is_multicast:
         raise UsageError(f"--lan {text} is no address that another machine can connect to", hint=_EXAMPLE)
     return str(address)
