@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from client_sdk.commands.subscriptions import BlockingUpdates, Updates
     from client_sdk.commands.traffic_stats import Stats
     from client_sdk.datasets import Dataset, open_dataset
-    from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+    from client_sdk.frontend import Frame, FrontEndOptions, MonocularOptions, PoseQuery, TrackedFrame
     from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions, OtherRobot
     from client_sdk.map_merge import merge_maps
     from client_sdk.mapper import Mapper
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from client_sdk.offloading.offload_policy import CloudFirst
     from client_sdk.point_map import MapOptions, PointMap
     from client_sdk.robot import Robot, connect
-    from client_sdk.tracking.monocular_tracker import MonocularOptions
     from client_sdk.tracking.tracker import Tracker
     from client_sdk.trajectory import Trajectory
     from client_sdk.transfer.data_client import DataClient, DataOptions
@@ -86,7 +85,7 @@ _HOMES = {
     "MapOptions": "point_map",
     "Mapper": "mapper",
     "MarkerScale": "monocular.scale",
-    "MonocularOptions": "tracking.monocular_tracker",
+    "MonocularOptions": "frontend",
     "OdometryScale": "monocular.scale",
     "OtherRobot": "live",
     "PointMap": "point_map",

@@ -33,6 +33,7 @@ __all__ = [
     "Features",
     "Frame",
     "FrontEndOptions",
+    "MonocularOptions",
     "PoseQuery",
     "TrackedFrame",
     "describe",
@@ -204,6 +205,42 @@ class FrontEndOptions:
         find 11 to 13 for the first pair.
         """
         return cls(features=4000, is_spread=False, inlier_px=4.0, min_inliers=12)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MonocularOptions:
+    """Options of tracking a camera without depth.
+
+    Attributes:
+        features: Number of features of a frame of 640 px; wider frames have more, up to 2000.
+        max_matches: Largest number of matches that a pose query sends, an even sample of all; 250 keep the
+            command of a query below 10 kB with the codecs zlib and MessagePack, and below 11 kB with JSON.
+        inlier_px: Largest reprojection error, in pixels, of an inlier of a pose query.
+        max_iterations: Largest number of RANSAC iterations.
+        min_inliers: Smallest number of inliers of an accepted pose.
+        search_px: Radius, in pixels, around the predicted pixel of a landmark in which features are compared
+            with the landmark.
+        keyframe_share: A frame that sees less than this share of its reference keyframe's landmarks becomes a
+            keyframe.
+        keyframe_deg: A frame rotated by more than this from its reference keyframe becomes a keyframe.
+        keyframe_depth_percent: A frame that moved farther than this from its reference keyframe, in percent
+            of the median depth, becomes a keyframe.
+        start_parallax_deg: Smallest median parallax of the two views that begin a segment.
+        segment_after: Number of frames since the last pose, with enough features and no recognised place,
+            after which a new segment begins.
+    """
+
+    features: int = 1000
+    max_matches: int = 250
+    inlier_px: float = 3.0
+    max_iterations: int = 1000
+    min_inliers: int = 20
+    search_px: float = 40.0
+    keyframe_share: float = 0.7
+    keyframe_deg: float = 10.0
+    keyframe_depth_percent: float = 10.0
+    start_parallax_deg: float = 2.0
+    segment_after: int = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

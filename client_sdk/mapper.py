@@ -34,7 +34,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from client_sdk.commands.answer_types import PoseAnswer
-from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.frontend import Features, Frame, FrontEndOptions, MonocularOptions, PoseQuery, TrackedFrame
 from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuSamples
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -42,7 +42,7 @@ from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, 
 from client_sdk.point_map import MapOptions, PointMap, write_ply
 from client_sdk.recording import NullRobotRecorder, RobotRecorder
 from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
-from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.segments import (
     DriveRecords,
     SegmentRecord,

@@ -45,14 +45,13 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from client_sdk.frontend import Frame, FrontEndOptions
+    from client_sdk.frontend import Frame, FrontEndOptions, MonocularOptions
     from client_sdk.live.live_mapper import LiveMapper
     from client_sdk.live.options import LiveOptions
     from client_sdk.mapper import Mapper
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
     from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction
     from client_sdk.point_map import MapOptions
-    from client_sdk.tracking.monocular_tracker import MonocularOptions
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
 

@@ -36,7 +36,6 @@ __all__ = [
     "Matches",
     "make_place_vector",
     "match_candidates",
-    "match_distant_place",
     "match_known_places",
     "match_other_segments",
     "shift_landmarks",
@@ -292,34 +291,6 @@ def match_other_segments(
         for keyframe in segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES)
     ]
     return match_candidates(maps, keyframes, image)[0]
-
-
-def match_distant_place(
-    maps: Mapping[int, RecognisableMap],
-    segment: int,
-    distances: Array,
-    min_distance: float,
-    place: LazyPlaceVector,
-    image: Features,
-) -> Candidate | None:
-    """Match the five most similar keyframes of a segment far from a recognised place; return the best.
-
-    Args:
-        maps: Map of each segment by its number.
-        segment: Number of the segment.
-        distances: ``(k,)``, distance of each keyframe of the segment from the recognised pose.
-        min_distance: Nearer keyframes are left out.
-        place: Place vector of the image.
-        image: Features of the image.
-
-    Returns:
-        The keyframe with the most matches; None if no keyframe is so far away.
-    """
-    far = np.flatnonzero(distances > min_distance)
-    if not len(far):
-        return None
-    similar = maps[segment].rank_by_similarity(place, _SIMILAR_KEYFRAMES, far)
-    return match_candidates(maps, [(segment, keyframe) for keyframe in similar], image)[0]
 
 
 def match_candidates(

@@ -9,6 +9,7 @@ takes the unit of the older one at that time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -17,7 +18,15 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import Features, Frame, PoseQuery, TrackedFrame, describe, make_features
+from client_sdk.frontend import (
+    Features,
+    Frame,
+    MonocularOptions,
+    PoseQuery,
+    TrackedFrame,
+    describe,
+    make_features,
+)
 from client_sdk.monocular.bundle import adjust
 from client_sdk.plugins import Plugins
 from client_sdk.tracking.landmark_map import (
@@ -36,7 +45,6 @@ from client_sdk.tracking.landmark_matching import (
     Matches,
     make_place_vector,
     match_candidates,
-    match_distant_place,
     match_known_places,
     match_other_segments,
     shift_landmarks,
@@ -50,7 +58,7 @@ from client_sdk.tracking.monocular_segment import (
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
 from client_sdk.tracking.reachability import (
-    ALIAS_DEPTH_SHARE,
+    DRIFT_DEPTH_SHARE,
     MAX_DRIFT,
     REACH_DEPTH_SHARE,
     reach_after,
@@ -63,7 +71,7 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, scaled, transform
 from rse_pf.slam.tracking import GuidedMatchLimits
 
-__all__ = ["MonocularOptions", "MonocularTracker"]
+__all__ = ["MonocularTracker"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -90,42 +98,6 @@ _MERGE_ITERATIONS = 6
 """Iterations of the bundle adjustment of all keyframes after a join, after a loop closure, and in
 `MonocularTracker.adjust`: bounds its time to seconds.  The two keyframes of a new segment are adjusted with
 the default of `LandmarkMap.adjust_all`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MonocularOptions:
-    """Options of tracking a camera without depth.
-
-    Attributes:
-        features: Number of features of a frame of 640 px; wider frames have more, up to 2000.
-        max_matches: Largest number of matches that a pose query sends, an even sample of all; 250 keep the
-            command of a query below 10 kB with the codecs zlib and MessagePack, and below 11 kB with JSON.
-        inlier_px: Largest reprojection error, in pixels, of an inlier of a pose query.
-        max_iterations: Largest number of RANSAC iterations.
-        min_inliers: Smallest number of inliers of an accepted pose.
-        search_px: Radius, in pixels, around the predicted pixel of a landmark in which features are compared
-            with the landmark.
-        keyframe_share: A frame that sees less than this share of its reference keyframe's landmarks becomes a
-            keyframe.
-        keyframe_deg: A frame rotated by more than this from its reference keyframe becomes a keyframe.
-        keyframe_depth_percent: A frame that moved farther than this from its reference keyframe, in percent
-            of the median depth, becomes a keyframe.
-        start_parallax_deg: Smallest median parallax of the two views that begin a segment.
-        segment_after: Number of frames since the last pose, with enough features and no recognised place,
-            after which a new segment begins.
-    """
-
-    features: int = 1000
-    max_matches: int = 250
-    inlier_px: float = 3.0
-    max_iterations: int = 1000
-    min_inliers: int = 20
-    search_px: float = 40.0
-    keyframe_share: float = 0.7
-    keyframe_deg: float = 10.0
-    keyframe_depth_percent: float = 10.0
-    start_parallax_deg: float = 2.0
-    segment_after: int = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -187,11 +159,11 @@ class MonocularTracker:
     before it also get poses.  A frame is matched near the pixels at which a constant velocity predicts the
     landmarks around the reference keyframe, then in a wider radius, then with the last frame, then with the
     newest keyframes and with the most similar keyframes of all segments; such a place is accepted only if the
-    camera can have moved there, and if no other place looks the same.  If no pose fits, the frame is lost,
-    and waits for the start of a new segment.  Two segments are joined when two measurements in a row agree
-    where one lies in the other, under the same two conditions; the newer segment is moved into the older one,
-    whose unit it takes.  An older place of the same segment that is recognised twice closes a loop and
-    corrects what drifted in between, if the camera can have drifted that far.
+    camera can have moved there.  If no pose fits, the frame is lost, and waits for the start of a new
+    segment.  Two segments are joined when two measurements in a row agree where one lies in the other, under
+    the same condition; the newer segment is moved into the older one, whose unit it takes.  An older place of
+    the same segment that is recognised twice closes a loop and corrects what drifted in between, if the
+    camera can have drifted that far.
 
     Attributes:
         options: Options of tracking.
@@ -497,9 +469,9 @@ class MonocularTracker:
             posed, reason = self._verify(segment, view, answer, count, keyframe)
             if posed is None:
                 continue
-            # 4. Accept a known place only if the camera can have moved there, and to no place like it.
-            if keyframe is not None and not (yield from self._is_certain_place(posed, attempt)):
-                reason = "a place to which the camera cannot have moved, or of which there are several"
+            # 4. Accept a known place only if the camera can have moved there: another one may look the same.
+            if keyframe is not None and not self._is_reachable(posed, attempt):
+                reason = "a place to which the camera cannot have moved"
                 continue
             if keyframe is not None:
                 self._state = replace(self._state, segment=attempt.segment, last=None, candidate=None)
@@ -566,50 +538,18 @@ class MonocularTracker:
             return None, "too few landmarks agree with the pose"
         return replace(fitted, matches=match_count, is_weak=answer.is_weak), ""
 
-    def _is_certain_place(
-        self, posed: PosedView, attempt: _Attempt
-    ) -> Generator[PoseQuery, QueryAnswer, bool]:
-        """Return whether the camera can have moved to a recognised place, and to no place like it.
+    def _is_reachable(self, posed: PosedView, attempt: _Attempt) -> bool:
+        """Return whether the camera can have moved to a recognised place since its last pose.
 
         A frame after a tracked one may be anywhere near its pose: the motion between two images can change.
         """
         position, last = inverse(posed.T_camera_world)[:3, 3], self._state.last
-        reach = reach_after(self._segments[attempt.segment].trajectory(), self._frame.timestamp_s)
         distance = float(np.median(np.linalg.norm(attempt.matches.points - position, axis=1)))
-        is_next = False
+        moved = math.inf
         if last is not None and attempt.segment == self._state.segment:
-            is_next = bool(np.linalg.norm(position - inverse(last.T_camera_world)[:3, 3]) <= distance)
-        if not is_next and reach.excess(position) > REACH_DEPTH_SHARE * distance:
-            return False
-        alias = yield from self._find_alias(posed.view, attempt.segment, position, distance)
-        return alias is None or reach.separates(position, alias)
-
-    def _find_alias(
-        self, view: MonocularView, segment: int, position: Array, distance: float
-    ) -> Generator[PoseQuery, QueryAnswer, Array | None]:
-        """Ask for the pose of an image at another place of a segment that looks the same as a recognised one.
-
-        Returned is the position ``(3,)`` of the camera there, None without such a place.
-
-        Args:
-            view: The image.
-            segment: Number of the segment.
-            position: ``(3,)``, of the camera at the recognised place, in the frame of the segment.
-            distance: Distance of what the camera sees there, in the unit of the segment.
-        """
-        min_distance = ALIAS_DEPTH_SHARE * distance
-        distances = np.linalg.norm(self._segments[segment].map.positions - position, axis=1)
-        other = match_distant_place(
-            self._maps, segment, distances, min_distance, view.place_vector, view.features
-        )
-        if other is None or len(other.matches) < CLEAR_INLIERS:
-            return None
-        answer = yield self._make_query(view, other.matches, "keyframe")
-        pose = answer.accepted_pose(CLEAR_INLIERS) if self._is_clear(answer, len(other.matches)) else None
-        if pose is None:
-            return None
-        alias = inverse(pose)[:3, 3]
-        return alias if np.linalg.norm(alias - position) > min_distance else None
+            moved = float(np.linalg.norm(position - inverse(last.T_camera_world)[:3, 3]))
+        reach = reach_after(self._segments[attempt.segment].trajectory(), self._frame.timestamp_s)
+        return moved <= distance or reach.excess(position) <= REACH_DEPTH_SHARE * distance
 
     # --- The start of a segment ---
 
@@ -777,8 +717,8 @@ class MonocularTracker:
         similarity = yield from self._measure_similarity(last, best)
         if similarity is None:
             return
-        # 2. Leave out a place that the camera cannot have reached, or that is not the only one of its kind.
-        if not (yield from self._is_certain_join(last, similarity)):
+        # 2. Leave out a place that the camera cannot have reached: it may be another one that looks the same.
+        if not self._is_reachable_join(last, similarity):
             return
         # 3. Move the newer of the two segments into the older one, whose poses and unit stay as they are.
         if similarity.segment < present:
@@ -787,10 +727,8 @@ class MonocularTracker:
             back = similarity.inverted(present, self._present.reference)
             self._join(similarity.segment, back, similarity.keyframe)
 
-    def _is_certain_join(
-        self, last: PosedView, similarity: Similarity
-    ) -> Generator[PoseQuery, QueryAnswer, bool]:
-        """Return whether the camera can have moved from the older to the newer segment, at this place only.
+    def _is_reachable_join(self, last: PosedView, similarity: Similarity) -> bool:
+        """Return whether the camera can have moved from the older of two segments to the newer one.
 
         *similarity* tells where the present segment, which has the frame *last*, lies in another one.
         """
@@ -805,17 +743,13 @@ class MonocularTracker:
         else:
             begin = similarity.moved(begin)
         depth = self._segments[other].map.median_depth(similarity.keyframe)
+        if unit * reach.excess(begin) <= REACH_DEPTH_SHARE * depth:
+            return True
+        # 2. Two places that look the same do not overlap: wait until the camera has moved farther than they
+        #    can be apart.
         centre = inverse(last.T_camera_world)[:3, 3]
-        if unit * reach.excess(begin) > REACH_DEPTH_SHARE * depth:
-            # The place may be another one that looks the same.  Two such places do not overlap: wait until
-            # the camera has moved farther than they can be apart.
-            moved = similarity.scale * float(np.linalg.norm(centre - self._state.first_position))
-            if moved < unit * reach.farthest(begin):
-                return False
-        # 2. Look for another place in the other segment that looks the same.
-        position = similarity.moved(centre)
-        alias = yield from self._find_alias(last.view, other, position, depth)
-        return alias is None or reach.separates(begin, begin + (alias - position) / unit)
+        moved = similarity.scale * float(np.linalg.norm(centre - self._state.first_position))
+        return moved >= unit * reach.farthest(begin)
 
     def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
         """Ask for the place of a new keyframe among older ones; close a loop once two measurements agree."""
@@ -839,7 +773,7 @@ class MonocularTracker:
         positions = own.positions
         length = float(np.linalg.norm(np.diff(positions[best.keyframe :], axis=0), axis=1).sum())
         drift = float(np.linalg.norm(similarity.moved(positions[-1]) - positions[-1]))
-        if drift > MAX_DRIFT * length + ALIAS_DEPTH_SHARE * own.median_depth(best.keyframe):
+        if drift > MAX_DRIFT * length + DRIFT_DEPTH_SHARE * own.median_depth(best.keyframe):
             return
         # 4. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
         self._state = replace(

@@ -15,7 +15,7 @@ from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array
 
 __all__ = [
-    "ALIAS_DEPTH_SHARE",
+    "DRIFT_DEPTH_SHARE",
     "MAX_DRIFT",
     "REACH_DEPTH_SHARE",
     "Reach",
@@ -24,12 +24,12 @@ __all__ = [
     "reach_between",
 ]
 
-ALIAS_DEPTH_SHARE = 0.5
-"""Two recognised places are different ones that look the same if they are farther apart than this share of
-the distance of what the camera sees: the drift within a map is less."""
 MAX_DRIFT = 0.2
 """Largest drift of a tracked camera without depth, as a share of the length of its path, in addition to
-`ALIAS_DEPTH_SHARE`: a loop closure that corrects more most likely connects two places that look the same."""
+`DRIFT_DEPTH_SHARE`: a loop closure that corrects more most likely connects two places that look the same."""
+DRIFT_DEPTH_SHARE = 0.5
+"""Drift that is allowed in addition to `MAX_DRIFT`, as a share of the distance of what the camera sees: two
+places that look the same are farther apart."""
 REACH_DEPTH_SHARE = 0.1
 """A recognised pose may lie outside the reach by this share of the distance of what the camera sees there:
 poses have errors, and maps drift."""
@@ -62,15 +62,6 @@ class Reach:
     def farthest(self, position: Array) -> float:
         """Return the largest distance of a ``(3,)`` position from a point of the ball."""
         return float(np.linalg.norm(position - self.centre)) + self.radius
-
-    def separates(self, position: Array, alias: Array) -> bool:
-        """Return whether at most one of places as far apart as *position* and *alias* is within the reach.
-
-        Where two places look the same, more of them may exist at the same distance, also where the camera
-        has never been.
-        """
-        radius = max(self.radius, float(np.linalg.norm(position - self.centre)))
-        return 2.0 * radius < float(np.linalg.norm(position - alias))
 
 
 def reach_after(path: Trajectory, stamp_s: float, known_motion: float = 0.0, known_s: float = 0.0) -> Reach:

@@ -25,21 +25,18 @@ from client_sdk.tracking.keyframe_map import KeyframeMap, PosedView, View, obser
 from client_sdk.tracking.landmark_matching import (
     GUIDED_MATCHES_FACTOR,
     JOIN_INTERVAL_FRAMES,
-    MAX_JOIN_DIFFERENCE_DEG,
     NO_LANDMARK,
     VERIFY_LOWE_RATIO,
     VERIFY_RADIUS_PX,
     Candidate,
     Matches,
     make_place_vector,
-    match_distant_place,
     match_known_places,
     match_other_segments,
     shift_landmarks,
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
 from client_sdk.tracking.reachability import (
-    ALIAS_DEPTH_SHARE,
     REACH_DEPTH_SHARE,
     Reach,
     reach_after,
@@ -52,7 +49,7 @@ from client_sdk.tracking.rolling_shutter import (
     measure_readout_change,
     rotation_rate,
 )
-from client_sdk.tracking.segment_join import NOT_JOINED, Join
+from client_sdk.tracking.segment_join import NOT_JOINED, Join, JoinCandidate
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
 from rse_pf.geometry import Array, inverse, orthonormalise, pose_difference, rigid, transform
 from rse_pf.slam.tracking import GuidedMatchLimits, fit_pose
@@ -91,31 +88,6 @@ is tracked, but its image is used as it is."""
 _MAX_STEREO_MATCHES = 250
 """Largest number of matches that a query of a stereo pair sends: after the answer, the robot itself fits the
 pose to all matched landmarks."""
-_MAX_JOIN_DIFFERENCE_M = 0.15
-"""Largest translation, in metres, between two measurements of the pose of one segment in another one, for the
-two to confirm each other."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _JoinCandidate:
-    """Where the present segment may lie in another one, measured once or more often.
-
-    Attributes:
-        segment: Number of the other segment.
-        T_other_present: ``(4, 4)``, pose of the present segment's world in that of the other one.
-        first_position: ``(3,)``, of the camera in the present segment at the first of the measurements in a
-            row that agree.
-    """
-
-    segment: int
-    T_other_present: Array
-    first_position: Array
-
-    def agrees_with(self, segment: int, T_other_present: Array) -> bool:
-        """Return whether a further measurement confirms this one."""
-        apart_m, apart_deg = pose_difference(self.T_other_present, T_other_present)
-        is_near = apart_m <= _MAX_JOIN_DIFFERENCE_M and apart_deg <= MAX_JOIN_DIFFERENCE_DEG
-        return segment == self.segment and is_near
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,7 +123,7 @@ class _TrackState:
     lost_in_a_row: int = 0
     unrecognised: int = 0
     segment: int = -1
-    join_candidate: _JoinCandidate | None = None
+    join_candidate: JoinCandidate | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -200,12 +172,11 @@ class Tracker:
     keyframes and of the last frame.  If no pose fits, it is matched with the last frame by appearance; a
     stereo pair is then matched in a wide radius around its last pose.  If no pose fits again, it is matched
     with the newest keyframes and with the most similar keyframes of all segments; such a place is accepted
-    only if the camera can have moved there, and if no other place looks the same.  Otherwise the frame is
-    lost, and the next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised
-    frames a new segment begins at the last accepted pose.  Two segments are joined when two measurements in a
-    row agree where one lies in the other, under the same two conditions; the newer segment is moved into the
-    older one.  A frame with a weak
-    pose never becomes a keyframe.
+    only if the camera can have moved there.  Otherwise the frame is lost, and the next one is tried in the
+    same order.  After `FrontEndOptions.segment_after` unrecognised frames a new segment begins at the last
+    accepted pose.  Two segments are joined when two measurements in a row agree where one lies in the other,
+    under the same condition; the newer segment is moved into the older one.  A frame with a weak pose never
+    becomes a keyframe.
 
     Attributes:
         options: Options of the front end.
@@ -511,8 +482,8 @@ class Tracker:
             posed = self._verify(image, T_world_camera, attempt, answer, is_continuous=is_continuous)
             if posed is None:
                 continue
-            # 4. Accept a known place only if the camera can have moved there, and to no place like it.
-            if attempt.is_recognised and not (yield from self._is_certain_place(posed, attempt)):
+            # 4. Accept a known place only if the camera can have moved there: another one may look the same.
+            if attempt.is_recognised and not self._is_reachable(posed, attempt):
                 continue
             if attempt.segment != self._state.segment:
                 self._state = replace(self._state, segment=attempt.segment, last=None, join_candidate=None)
@@ -567,45 +538,20 @@ class Tracker:
         moved_m = np.linalg.norm(position - self._state.T_world_camera[:3, 3])
         return attempt.segment == self._state.segment and bool(moved_m <= attempt.distance_to(position))
 
-    def _is_certain_place(
-        self, posed: PosedView, attempt: _Attempt
-    ) -> Generator[PoseQuery, QueryAnswer, bool]:
-        """Return whether the camera can have moved to a recognised place, and to no place like it.
+    def _is_reachable(self, posed: PosedView, attempt: _Attempt) -> bool:
+        """Return whether the camera can have moved to a recognised place since its last pose.
 
         A frame after a tracked one may be anywhere near its pose: the motion between two images can change.
         """
         position, own = posed.T_world_camera[:3, 3], self._map.trajectory()
+        if not self._state.lost_in_a_row and self._is_near(posed.T_world_camera, attempt):
+            return True
         if attempt.segment == self._state.segment:
             reach = reach_after(own, self._frame.timestamp_s)
         else:
             path = self._segments[attempt.segment].trajectory()
             reach = reach_between(path, own, self._frame.timestamp_s)
-        is_next = not self._state.lost_in_a_row and self._is_near(posed.T_world_camera, attempt)
-        if not is_next and reach.excess(position) > REACH_DEPTH_SHARE * attempt.distance_to(position):
-            return False
-        alias = yield from self._find_alias(posed, attempt)
-        return alias is None or reach.separates(position, alias)
-
-    def _find_alias(
-        self, posed: PosedView, attempt: _Attempt
-    ) -> Generator[PoseQuery, QueryAnswer, Array | None]:
-        """Ask for the pose of an image at another place of a segment that looks the same as a recognised one.
-
-        Returned is the position ``(3,)`` of the camera there, None without such a place.
-        """
-        view, position, segment = posed.view, posed.T_world_camera[:3, 3], attempt.segment
-        min_distance_m = ALIAS_DEPTH_SHARE * attempt.distance_to(position)
-        distances_m, _ = self._segments[segment].distances(posed.T_world_camera)
-        other = match_distant_place(
-            self._segments, segment, distances_m, min_distance_m, view.place_vector, view.features
-        )
-        if other is None or len(other.matches) < CLEAR_INLIERS:
-            return None
-        T_world_camera, answer = yield from self._solve(view, self._attempt_at(other, "keyframe"))
-        if T_world_camera is None or not answer.is_clear(min(len(other.matches), self._max_matches)):
-            return None
-        is_apart = np.linalg.norm(T_world_camera[:3, 3] - position) > min_distance_m
-        return T_world_camera[:3, 3] if is_apart and self._looks_right(T_world_camera, segment) else None
+        return reach.excess(position) <= REACH_DEPTH_SHARE * attempt.distance_to(position)
 
     def _looks_right(self, T_world_camera: Array, segment: int) -> bool:
         """Return whether the image looks as a pose in a segment predicts; True for a user's features."""
@@ -877,29 +823,25 @@ class Tracker:
         there = self._verify(view, T_other_camera, attempt, answer)
         if there is None:
             return
-        # 2. Leave out a place that the camera cannot have reached or that is not the only one of its kind.
+        # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
         T_other_present = orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
-        reach, begin = self._reach_of_join(best.segment, T_other_present)
-        alias = yield from self._find_alias(there, attempt)
-        position = there.T_world_camera[:3, 3]
-        if alias is not None and not reach.separates(begin, begin + alias - position):
-            return
-        # 3. Keep the measurement as the candidate; go on only if the candidate before it agrees.
         here, previous = posed.T_world_camera[:3, 3], self._state.join_candidate
         is_confirmed = previous is not None and previous.agrees_with(best.segment, T_other_present)
         first_position = previous.first_position if previous is not None and is_confirmed else here
-        candidate = _JoinCandidate(
+        candidate = JoinCandidate(
             segment=best.segment, T_other_present=T_other_present, first_position=first_position
         )
         self._state = replace(self._state, join_candidate=candidate)
         if not is_confirmed:
             return
-        # 4. If the camera cannot have moved there, the place may be another one that looks the same.  Two
+        # 3. If the camera cannot have moved there, the place may be another one that looks the same.  Two
         #    such places do not overlap: wait until the camera has moved farther than they can be apart.
-        is_reached = reach.excess(begin) <= REACH_DEPTH_SHARE * attempt.distance_to(position)
+        reach, begin = self._reach_of_join(best.segment, T_other_present)
+        distance_m = attempt.distance_to(there.T_world_camera[:3, 3])
+        is_reached = reach.excess(begin) <= REACH_DEPTH_SHARE * distance_m
         if not is_reached and np.linalg.norm(here - first_position) < reach.farthest(begin):
             return
-        # 5. Move the newer of the two segments into the older one, whose poses stay as they are.
+        # 4. Move the newer of the two segments into the older one, whose poses stay as they are.
         if best.segment < present:
             self._join(present, best.segment, T_other_present)
         else:

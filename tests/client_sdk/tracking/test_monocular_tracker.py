@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from client_sdk.datasets.rig_recordings import open_kitti
-from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
+from client_sdk.frontend import Frame, MonocularOptions, PoseQuery, TrackedFrame
 from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
 from client_sdk.tracking.landmark_matching import NO_LANDMARK, make_place_vector
-from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.trajectory_error import accuracy

@@ -17,9 +17,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from client_sdk.frontend import FrontEndOptions
+from client_sdk.frontend import FrontEndOptions, MonocularOptions
 from client_sdk.plugins import load_features
-from client_sdk.tracking.monocular_tracker import MonocularOptions
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.storage.files import read_document
