@@ -4,11 +4,13 @@ An operator writes it with ``rse-pf robot enrol ROBOT --out FILE`` and carries i
 private key: it is created with mode 0600, and refused if others may read it.  JSON, one object:
 
 - ``format``: ``rse-pf-enrolment``; ``version``: 1.  Readers ignore unknown members.
-- ``url``: where robots connect, ``wss://`` or ``ws://``.
-- ``authority``: certificate (PEM) that alone may vouch for the address; empty: those of the machine.
-- ``robot``, ``tenant``: the name under which the robot is enrolled.
-- ``key``: the private key, a JWK (RFC 8037).
-- ``issuer``, ``audience``, ``token_ttl_s``: of the tokens that the robot signs with it.
+- ``url``: address to which the robot connects, ``wss://`` or ``ws://``.
+- ``authority``: the only certificate authority (PEM) that the robot trusts for ``url``.  If it is empty, the
+  robot trusts the certificate authorities of its machine.
+- ``robot``, ``tenant``: the name and the tenant under which the robot is enrolled.
+- ``key``: the robot's private key, a JWK (RFC 8037).
+- ``issuer``, ``audience``, ``token_ttl_s``: issuer, audience and validity (seconds) of the tokens that the
+  robot signs with ``key``.
 """
 
 from __future__ import annotations
@@ -29,12 +31,14 @@ from rse_pf.storage.files import create_private_file, read_private_file
 
 __all__ = ["Enrolment", "EnrolmentFile"]
 
-_ID_BYTES = 12
+# Random bytes of a token's id, so that no two tokens of a robot have the same id.
+_TOKEN_ID_BYTES = 12
+# Hint of each error about an enrolment file that is missing or damaged.
 _HINT = "make one with rse-pf robot enrol ROBOT --out FILE"
 
 
 class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of the file."""
+    """The content of an enrolment file; the docstring of this module describes the fields."""
 
     format: Literal["rse-pf-enrolment"] = "rse-pf-enrolment"
     version: Literal[1] = 1
@@ -49,7 +53,7 @@ class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def read(cls, path: str | Path) -> Enrolment:
-        """Return the enrolment in *path*.
+        """Return the enrolment in the file *path*.
 
         Raises:
             UsageError: There is no such file, others may read it, or it holds no enrolment.
@@ -73,17 +77,25 @@ class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
             ) from error
 
     def token(self, *, now_s: float, token_id: str) -> str:
-        """Return a token that the robot signs, valid from *now_s* (Unix); raises UsageError for a bad key."""
+        """Return a robot token, signed with ``key`` and valid for ``token_ttl_s`` seconds from *now_s*.
+
+        Args:
+            now_s: Unix seconds.
+            token_id: Id of the token (``jti``), by which an operator can revoke it.
+
+        Raises:
+            UsageError: ``key`` is not a private key, or ``robot`` or ``token_ttl_s`` is invalid.
+        """
         settings = AuthSettings(audience=self.audience, token_ttl_s=self.token_ttl_s)
         key = SigningKey.from_json(msgspec.json.encode(self.key))
         return key.issue(self.robot, now=now_s, token_id=token_id, settings=settings)
 
 
 class EnrolmentFile:
-    """The enrolment in a file, read anew for each token, so that a replaced key takes effect at once."""
+    """An enrolment file that is read again for each token, so that a replaced key takes effect at once."""
 
     def __init__(self, path: str | Path, *, clock: Callable[[], float] = time.time) -> None:
-        """Store the path; *clock* returns Unix seconds."""
+        """Store the path without reading the file; *clock* returns Unix seconds."""
         self._path = Path(path)
         self._clock = clock
 
@@ -93,7 +105,7 @@ class EnrolmentFile:
 
     def fresh_token(self) -> str:
         """Return a new token, signed with the robot's key; raises UsageError if file or key is invalid."""
-        return self.read().token(now_s=self._clock(), token_id=secrets.token_hex(_ID_BYTES))
+        return self.read().token(now_s=self._clock(), token_id=secrets.token_hex(_TOKEN_ID_BYTES))
 
     async def token(self) -> str:
         """Return what `fresh_token` returns, as the coroutine function that `client_sdk.connect` takes."""

@@ -57,7 +57,7 @@ __all__ = [
 ]
 
 ERRORS_PAGE = "docs/errors.md"
-"""The page of all errors; each code is an anchor on it."""
+"""Path of the documentation page about all errors; each error code is an anchor on this page."""
 
 
 class RsePfError(Exception):
@@ -86,7 +86,7 @@ class RsePfError(Exception):
         self.retry_after_ms = retry_after_ms
 
     def __str__(self) -> str:
-        """Return message, hint and the address of the code's explanation, one line each, for tracebacks."""
+        """Return the message, the hint (if there is one) and `address`, one line each, for tracebacks."""
         lines = [self.message, f"  hint: {self.hint}"] if self.hint else [self.message]
         return "\n".join([*lines, f"  see: {self.address()}"])
 
@@ -95,19 +95,23 @@ class RsePfError(Exception):
 
     @classmethod
     def address(cls) -> str:
-        """Return where the code is explained: the section of the documentation, and the command."""
+        """Return where a user finds the explanation of the code.
+
+        Example: ``docs/errors.md#busy, or run: rse-pf errors busy``.
+        """
         return f"{ERRORS_PAGE}#{cls.code}, or run: rse-pf errors {cls.code}"
 
     def report(self) -> str:
-        """Return the two lines shown to a user: what is wrong, and what to do."""
+        """Return what a user sees: the class and the message, then a line with the hint if there is one."""
         first = f"{type(self).__name__}: {self.message}"
         return f"{first}\n  hint: {self.hint}" if self.hint else first
 
 
+# The class of the error with each code; a subclass without a code of its own is not entered.
 _KIND_OF_CODE = {RsePfError.code: RsePfError}
 
 
-# --- mistakes of the operator or the developer -------------------------------------------
+# --- errors of configuration and usage, which the operator or developer corrects ----------
 
 
 class ConfigurationError(RsePfError, code="configuration"):
@@ -169,7 +173,7 @@ class MissingExtra(ConfigurationError, code="missing-extra"):
         return f"pip install 'rse-pf{chosen}'" if chosen else "pip install rse-pf"
 
 
-# --- authentication --------------------------------------------------------------------------------
+# --- errors of authentication and authorization ----------------------------------------------------
 
 
 class AuthError(RsePfError, code="auth"):
@@ -204,7 +208,7 @@ class Forbidden(AuthError, code="forbidden"):
     """
 
 
-# --- the wire --------------------------------------------------------------------------------
+# --- errors of messages and connections of the robot protocol ----------------------------------
 
 
 class ProtocolError(RsePfError, code="protocol"):
@@ -262,7 +266,7 @@ class Disconnected(ProtocolError, code="disconnected"):
     """
 
 
-# --- a command that was not answered with a result ---------------------------------------------
+# --- errors that are the answer to a command in place of a result -------------------------------
 
 
 class CommandFailed(RsePfError, code="failed"):
@@ -368,7 +372,8 @@ class Crashed(CommandFailed, code="crashed"):
 class Poison(CommandFailed, code="poison"):
     """This request ended the processes that computed it, and is refused for a while.
 
-    Cause: Two sandboxes crashed on it (refused for ten minutes), or three owners of its job (for a week).
+    Cause: Two sandboxes crashed on it (refused for ten minutes), or three servers failed while they ran its
+        job (refused for a week).
     Check: Run rse-pf service status: it shows what sandboxes refuse, to whom and for how long.
     Fix: Correct the service, install it again and run rse-pf service unblock SERVICE; for a job, send less,
         or delete the object that the hint names.
@@ -384,7 +389,7 @@ class InternalError(CommandFailed, code="internal"):
     """
 
 
-# --- perspective-n-point -----------------------------------------------------------------------
+# --- errors of perspective-n-point (PnP): a frame gets no pose ------------------------------------
 
 
 class PnpError(RsePfError, code="pnp"):
@@ -433,7 +438,7 @@ class InvalidCamera(PnpError, code="invalid-camera"):
     """
 
 
-# --- objects -----------------------------------------------------------------------------------
+# --- errors of deployments on AWS, and of the object store -----------------------------------------
 
 
 class DeploymentFailed(RsePfError, code="deployment"):
@@ -474,9 +479,9 @@ class Conflict(StoreError, code="conflict"):
 
 
 class StoreFull(StoreError, code="store-full"):
-    """The disk is full, or nearly full and the tenant holds its share of it; nothing was stored.
+    """The disk is full, or nearly full and the tenant uses more than its part of it; nothing was stored.
 
-    Cause: Less than 10 % of the store's disk is free, and the tenant holds more than its share of it.
+    Cause: The disk is full, or less than 10 % of it is free and the tenant stores more than an equal part.
     Check: Run df on the folder of data.store.
     Fix: Delete objects or maps of this tenant, or use a larger disk.
     """
@@ -504,14 +509,18 @@ class Archived(StoreError, code="archived"):
 def error_from_code(
     code: str, message: str, *, hint: str = "", retry_after_ms: float | None = None
 ) -> RsePfError:
-    """Return the error that *code* stands for; an unknown code gives ``CommandFailed``."""
+    """Return an error of the class with this *code*, `CommandFailed` for an unknown code."""
     error = _bare(_KIND_OF_CODE.get(code, CommandFailed), message)
     error.hint, error.retry_after_ms = hint, retry_after_ms
     return error
 
 
 def error_of_system(error: OSError) -> RsePfError:
-    """Return the error of a refused system call, with its file or address and a fitting hint."""
+    """Return the `RsePfError` for the OSError *error* of a system call.
+
+    Its message holds the text of the errno and, if *error* has one, the file name.  Its class and hint are
+    those of the errno in `_OF_SYSTEM`, else `RsePfError` and a general hint.
+    """
     cause = error.strerror or str(error) or type(error).__name__
     named = "" if error.filename is None else f": {str(error.filename)!r}"
     kind, hint = _OF_SYSTEM.get(
@@ -520,6 +529,7 @@ def error_of_system(error: OSError) -> RsePfError:
     return kind(f"{cause}{named}", hint=hint)
 
 
+# By errno of a failed system call: the class and the hint of the error that a user sees.
 _OF_SYSTEM: dict[int, tuple[type[RsePfError], str]] = {
     errno.ENOSPC: (StoreFull, "free some space (df -h), or name a folder on another disk"),
     errno.EDQUOT: (StoreFull, "free some of your quota, or name a folder on another disk"),
@@ -537,12 +547,15 @@ _OF_SYSTEM: dict[int, tuple[type[RsePfError], str]] = {
 
 
 def message_of(error: BaseException) -> str:
-    """Return the message of *error* in one sentence, without the hint and address of an `RsePfError`."""
+    """Return the message of *error*; of an `RsePfError` without its hint and its `address`."""
     return error.message if isinstance(error, RsePfError) else str(error)
 
 
 def _bare(kind: type[RsePfError], message: str) -> RsePfError:
-    """Return an error of *kind* without calling its constructor, whose arguments are not sent."""
+    """Return an error of the class *kind* with *message*, without a call of the constructor of *kind*.
+
+    An error that was pickled or received has only its message, not the other arguments of the constructor.
+    """
     error = kind.__new__(kind)
     RsePfError.__init__(error, message)
     return error

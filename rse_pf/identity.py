@@ -20,12 +20,14 @@ __all__ = [
     "state_name",
 ]
 
+# The tenant of robots and tokens that name none.
 DEFAULT_TENANT = "default"
+# A text that `name_segment` uses as it is: at most 64 lower-case letters, digits and hyphens.
 _PLAIN_SEGMENT = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 
 
 def name_segment(text: str) -> str:
-    """Return a segment of an object's name for any *text*; no two texts have the same.
+    """Return *text* as one segment of an object's name; different texts have different segments.
 
     A text that is not plain (a lower-case letter or digit, then at most 63 of these and hyphens) becomes
     ``x=`` and its sha256 in hex.
@@ -39,8 +41,8 @@ class RobotId(NamedTuple):
     """One robot; a hashable value that two processes may exchange as a list of three texts.
 
     Attributes:
-        tenant: Of the token or the roster.
-        name: Unique in the tenant at any time.
+        tenant: The robot's tenant, which its token or its entry in the roster states.
+        name: The robot's name, which no other robot of the tenant has at the same time.
         enrolment: RFC 7638 thumbprint of the key that was enrolled; "" for a robot whose tokens the platform
             signs, and where no token is required.
     """
@@ -56,7 +58,10 @@ class RobotId(NamedTuple):
 
     @property
     def folder(self) -> str:
-        """``TENANT/ROBOT`` or ``TENANT/ROBOT=THUMBPRINT``, for names of objects; no two robots share one."""
+        """``TENANT/ROBOT`` or, with an enrolment, ``TENANT/ROBOT=THUMBPRINT``: part of names of objects.
+
+        Tenant and robot are segments by `name_segment`; no two robots have the same folder.
+        """
         name = name_segment(self.name)
         return f"{name_segment(self.tenant)}/{name}{'=' if self.enrolment else ''}{self.enrolment}"
 
@@ -67,14 +72,17 @@ def object_name(robot: RobotId, digest: str) -> str:
 
 
 def state_name(robot: RobotId, service: str) -> str:
-    """Return the name of the state of *service* for *robot*: ``states/TENANT/ROBOT[=THUMBPRINT]/SERVICE``."""
+    """Return the name of the object that stores the state of *service* for *robot*.
+
+    It is ``states/TENANT/ROBOT[=THUMBPRINT]/SERVICE``.
+    """
     return f"states/{robot.folder}/{service}"
 
 
 def shown_name(folder: str) -> str:
-    """Return the name of the robot with this `RobotId.folder`, without its enrolment.
+    """Return the name of the robot with this `RobotId.folder`, without its tenant and enrolment.
 
-    A name that is no plain segment is shown as the digest that stands for it.
+    Of a name that `name_segment` replaced by a digest, the result is this segment, ``x=DIGEST``.
     """
     robot = folder.rpartition("/")[2]
     if robot.startswith("x="):
@@ -83,6 +91,6 @@ def shown_name(folder: str) -> str:
 
 
 def folders_of(name: str, folders: list[str]) -> list[str]:
-    """Return those of *folders* that belong to robots called *name*, whatever their enrolment."""
+    """Return those `RobotId.folder` in *folders* that belong to robots called *name*, of any enrolment."""
     wanted = {name, name_segment(name)}
     return [folder for folder in folders if shown_name(folder) in wanted]

@@ -1,6 +1,6 @@
 """Load OpenCV, and decode images that may be untrusted.
 
-The header of an image in memory is checked before anything of it is decoded.
+`decode_photo` checks the structure and the stated size of a JPEG or PNG before it decodes pixels.
 """
 
 from __future__ import annotations
@@ -21,26 +21,31 @@ from rse_pf.errors import BadRequest, LimitExceeded, MissingExtra
 __all__ = ["MAX_IMAGE_PIXELS", "MAX_PHOTO_PIXELS", "decode_photo", "load_opencv", "photo_size", "read_image"]
 
 MAX_IMAGE_PIXELS = 1 << 25
-"""Of one image: a frame of 8K video has fewer, and decoding it takes some 200 MB."""
+"""Largest number of pixels of an image that OpenCV decodes: a frame of 8K video has slightly fewer, and takes
+some 200 MB of memory."""
 MAX_PHOTO_PIXELS = 1 << 24
-"""Of an image that is sent to a server: 16 megapixels."""
-_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
-"""OpenCV reads it when it is loaded, and compares it with the size in an image's header."""
-_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-_MAX_SEGMENTS = 1000  # of a JPEG, before its size
-_FILL_BYTES = re.compile(rb"\xff*(?=\xff)")  # may come before each marker of a JPEG
-_MAX_CHUNKS = 10_000  # of a PNG: programs write pixels in chunks of 8 KiB and more
-_CRITICAL_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
-_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a pixel, by the colour type of a PNG
-_MAX_PNG_BYTES = 5 * MAX_PHOTO_PIXELS  # inflated: four channels of 8 bits, and filter bytes
+"""Largest number of pixels of an image that a client sends to a server: 16 megapixels."""
+_OPENCV_LIMIT_VARIABLE = "OPENCV_IO_MAX_IMAGE_PIXELS"
+"""Environment variable with the most pixels of an image that OpenCV decodes; read when OpenCV is loaded."""
+_JPEG = b"\xff\xd8\xff"  # first bytes of each JPEG file
+_PNG = b"\x89PNG\r\n\x1a\n"  # first bytes of each PNG file
+_MAX_SEGMENTS = 1000  # segments of a JPEG that are searched for its size
+_FILL_BYTES = re.compile(rb"\xff*(?=\xff)")  # padding that a JPEG may have before each marker
+_MAX_CHUNKS = 10_000  # chunks of a PNG: programs write pixels in chunks of 8 KiB and more
+_CRITICAL_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # chunks that a decoder of PNG needs for the pixels
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the colour type of a PNG: channels of each pixel
+_MAX_PNG_BYTES = 5 * MAX_PHOTO_PIXELS  # inflated pixels of a PNG: four channels of 8 bits, and filter bytes
 _EXTRA_ROW_BYTES = 4  # the filter bytes and the last bits of a row in all seven passes of an interlaced PNG
 _MAX_SCANS = 20
-"""Each scan of a progressive JPEG goes over the whole image, however few bytes it has; cameras write ten."""
-_FRAMES, _NO_FRAMES = range(0xC0, 0xD0), (0xC4, 0xC8, 0xCC)
+"""Most scans of a JPEG.  Decoding a scan of a progressive JPEG costs time for the whole image, even if the
+scan has few bytes; cameras write ten scans."""
+_FRAMES = range(0xC0, 0xD0)  # markers of the JPEG segments that state the size of the image, and of others
+_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # markers in `_FRAMES` of segments that state no size
 _DECODED_FRAMES = (0xC0, 0xC1, 0xC2)
-"""Baseline, extended and progressive Huffman coding."""
-_SCAN, _END_OF_JPEG = b"\xff\xda", b"\xff\xd9"
-_END_OF_PNG = b"IEND"
+"""Markers of the JPEG codings that are accepted: baseline, extended and progressive Huffman coding."""
+_SCAN = b"\xff\xda"  # marker at the start of each scan of a JPEG
+_END_OF_JPEG = b"\xff\xd9"  # marker at the end of a JPEG
+_END_OF_PNG = b"IEND"  # name of the last chunk of a PNG
 _LONGEST_TRAILER = 1 << 16  # bytes that some programs write after the end of a PNG
 _HINT = "send a JPEG or PNG file as a camera writes it"
 
@@ -48,10 +53,10 @@ _HINT = "send a JPEG or PNG file as a camera writes it"
 def load_opencv() -> Any:
     """Return the module ``cv2``, which decodes no image above `MAX_IMAGE_PIXELS`; raises MissingExtra.
 
-    The limit does not hold in a program that imported ``cv2`` by itself before, nor where the environment
-    sets another one.
+    The limit does not hold if the program has imported ``cv2`` before.  If the environment variable
+    ``OPENCV_IO_MAX_IMAGE_PIXELS`` is set already, its limit holds instead.
     """
-    os.environ.setdefault(_LIMIT, str(MAX_IMAGE_PIXELS))
+    os.environ.setdefault(_OPENCV_LIMIT_VARIABLE, str(MAX_IMAGE_PIXELS))
     try:
         import cv2
     except ImportError as error:
@@ -60,16 +65,16 @@ def load_opencv() -> Any:
 
 
 def read_image(path: Path, flags: int) -> npt.NDArray[Any] | None:
-    """Return the image of a file as OpenCV decodes it with *flags*; None if it is damaged or too large.
+    """Return the image in the file *path* as OpenCV decodes it with *flags* (``cv2.IMREAD_...``).
 
-    Pixels stay as they are stored: an orientation in the EXIF data does not turn them, so that intrinsics and
-    depth fit.
+    None if the file cannot be read, is damaged or cut off, or has more than `MAX_IMAGE_PIXELS`.  The image is
+    not rotated by an orientation in its EXIF data, so that the intrinsics and the depth of the camera fit.
 
     Raises:
         MissingExtra: OpenCV is not installed.
     """
     cv2 = load_opencv()
-    if not path.is_file():  # OpenCV would print a warning, or wait for what a pipe brings
+    if not path.is_file():  # reading a pipe would wait for its writer
         return None
     try:
         data = path.read_bytes()
@@ -85,18 +90,22 @@ def read_image(path: Path, flags: int) -> npt.NDArray[Any] | None:
 
 
 def _is_cut_off(data: bytes) -> bool:
-    """Return whether a JPEG or PNG has no end: OpenCV would fill what is missing with grey."""
+    """Return whether a JPEG or PNG has no end: OpenCV would fill the missing pixels with grey.
+
+    False for a file of another format.
+    """
     if data.startswith(_JPEG):
         return data.rfind(_END_OF_JPEG) < max(0, data.rfind(_SCAN))
     return data.startswith(_PNG) and _END_OF_PNG not in data[-_LONGEST_TRAILER:]
 
 
 def photo_size(data: bytes) -> tuple[int, int]:
-    """Return width and height that the head of a JPEG or PNG states, px; nothing is decoded.
+    """Return the width and the height in pixels that the head of a JPEG or PNG states; decode no pixels.
 
     Raises:
-        BadRequest: It is neither, has no whole head or end, or is of a kind that no camera writes.
-        LimitExceeded: It has more than `MAX_PHOTO_PIXELS`, or too many parts.
+        BadRequest: *data* is neither JPEG nor PNG, is incomplete, states a size of 0, or has a coding that no
+            camera writes, such as an animation.
+        LimitExceeded: The image has more than `MAX_PHOTO_PIXELS`, or too many scans or chunks.
 
     Source:
         ITU-T T.81, Annex B; W3C PNG, Sect. 5 and 11.2.2.
@@ -118,12 +127,13 @@ def photo_size(data: bytes) -> tuple[int, int]:
 
 
 def decode_photo(data: bytes) -> npt.NDArray[np.uint8]:
-    """Return the ``(h, w, 3)`` image of a JPEG or PNG, red first, as its pixels are stored.
+    """Return the RGB image ``(height, width, 3)`` of a JPEG or PNG.
 
-    An orientation in its EXIF data does not turn it, so that intrinsics of the camera fit.
+    The image is not rotated by an orientation in its EXIF data, so that the intrinsics of the camera fit.
 
     Raises:
-        BadRequest, LimitExceeded: As `photo_size` says, or it is damaged.
+        BadRequest: As for `photo_size`, or the pixels are damaged.
+        LimitExceeded: As for `photo_size`.
         MissingExtra: OpenCV is not installed.
     """
     width, height = photo_size(data)
@@ -157,7 +167,10 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and content of the first segments, as far as they are whole."""
+    """Yield the marker (second byte) and the content of each segment at the start of a JPEG.
+
+    Ends without an error after `_MAX_SEGMENTS`, or at a segment that is damaged or incomplete.
+    """
     at = 2
     for _ in range(_MAX_SEGMENTS):
         fill = _FILL_BYTES.match(data, at)
@@ -188,11 +201,11 @@ def _png_size(data: bytes) -> tuple[int, int]:
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the name and all bytes of each chunk, which the last one ends.
+    """Yield the name and all bytes of each chunk of a PNG up to ``IEND``; bytes after ``IEND`` are ignored.
 
     Raises:
-        BadRequest: A chunk is not whole.
-        LimitExceeded: There are more than `_MAX_CHUNKS`.
+        BadRequest: The data end within a chunk, or before ``IEND``.
+        LimitExceeded: The PNG has more than `_MAX_CHUNKS`.
     """
     at = len(_PNG)
     for _ in range(_MAX_CHUNKS):
@@ -208,10 +221,10 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _critical_png(data: bytes) -> bytes:
-    """Return a PNG without what its pixels do not need: libpng would inflate it, or print about it.
+    """Return a PNG with its critical chunks only: libpng would inflate other chunks, or print warnings.
 
     Raises:
-        BadRequest: Its pixels are damaged, or inflate to more than its head states.
+        BadRequest: Its pixels are damaged, or inflate to more bytes than the size in its head allows.
     """
     chunks = [chunk for name, chunk in _png_chunks(data) if name in _CRITICAL_CHUNKS]
     width, height, bits, colour = struct.unpack_from(">IIBB", chunks[0], 8)

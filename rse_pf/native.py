@@ -37,6 +37,7 @@ PART_ABIS = {"check": 2, "cloud": 1, "depth": 1, "match": 4, "native": 5, "stere
 """For each part of the core the version of its C header ``native/include/rse_pf_PART.h`` that this package
 calls; a library with another version of a part is refused."""
 
+# File name of the shared library of the native core.
 _FILE = "librse_pf_native.so"
 
 

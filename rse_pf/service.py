@@ -28,23 +28,36 @@ from rse_pf.wire import Command, Failure, Result, as_type
 __all__ = ["Kind", "Registry", "Report", "Service", "dispatch", "failure_of", "request_of", "unknown_service"]
 
 Kind = Literal["stateless", "per_robot_state", "long"]
+"""Kind of a service: short calls without state, calls that keep a state for each robot, or long calls that
+run as jobs."""
 
 Report = Callable[[float, str], None]
-"""Called with the share that is done (0..1) and what was done; raises `Cancelled` to end the work."""
+"""Reports the progress of a long command: the part that is done (0..1), and a text about the last step.
+
+A call raises `Cancelled` if the command was cancelled, so that the service stops its work."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+# Name of the keyword parameter by which a long service receives a `Report`.
 _REPORT = "report"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """A registered function, and what a server needs to know about it.
+    """A registered service function, and how a server may run it.
 
-    A ``cheap`` service may run in the event loop when no command waits.  One that ``reports`` takes the
-    keyword ``report``: a long service that reports progress and can be cancelled then.  A ``limited`` one
-    decodes data that may expand to anything: a backend server computes it in a process that has a memory
-    limit and is killed at the deadline.  Such a process calls ``warm_up`` once, to import what is slow.
+    Attributes:
+        name: Name of the service in commands.
+        function: Takes a request and returns a reply.
+        request_type: Type of the request, a `msgspec.Struct`.
+        reply_type: Type of the reply, a `msgspec.Struct`.
+        kind: See `Kind`.
+        cheap: Whether a server may call the function in its event loop when no command waits.
+        reports: Whether the function takes the keyword ``report`` (a `Report`), through which a long service
+            reports progress and can be cancelled.
+        limited: Whether a request may decode to much more memory or work than its bytes show.  A backend
+            server calls the function in a process that has a memory limit and is killed at the deadline.
+        warm_up: Called once in such a process before the first request, to import slow modules.
     """
 
     name: str
@@ -69,7 +82,7 @@ class Registry:
     def __init__(self) -> None:
         self._services: dict[str, Service] = {}
         self.others: tuple[str, ...] = ()
-        """Names of services that run in sandboxes; they are listed in the error of an unknown service."""
+        """Names of the services that run in sandboxes; the error about an unknown service lists them, too."""
 
     def service(
         self,
@@ -80,7 +93,10 @@ class Registry:
         limited: bool = False,
         warm_up: Callable[[], object] | None = None,
     ) -> Callable[[Function], Function]:
-        """Register the decorated function under *name*; a long one may also take a keyword ``report``.
+        """Return a decorator that registers a function as the service *name*.
+
+        A function of the kind ``long`` may also take the keyword-only parameter ``report``, a `Report`.  The
+        arguments are the attributes of `Service` with the same names.
 
         Raises:
             ConfigurationError: The name is taken, the function is not annotated with one request and one
@@ -105,13 +121,13 @@ class Registry:
         return register
 
     def add(self, service: Service) -> None:
-        """Register *service*; its name must be free."""
+        """Register *service*; raises ConfigurationError if another service has its name."""
         if service.name in self._services:
             raise ConfigurationError(f"two services are named {service.name!r}", hint="rename one")
         self._services[service.name] = service
 
     def get(self, name: str) -> Service:
-        """Return the service called *name*, or raise UnknownService with what is offered."""
+        """Return the service called *name*; raises UnknownService, which lists the names of all services."""
         service = self._services.get(name)
         if service is None:
             raise unknown_service(name, self.names)
@@ -119,7 +135,7 @@ class Registry:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all services of this server, those that run in sandboxes included."""
+        """The names of all services of this server, including those that run in sandboxes."""
         return (*self._services, *self.others)
 
     def __iter__(self) -> Iterator[Service]:
@@ -136,17 +152,20 @@ def dispatch(
     report: Report | None = None,
     received_s: float | None = None,
 ) -> Result | Failure:
-    """Answer *command* with a result or a failure; never raise.
+    """Call the service that *command* names; return its reply as a Result, or an error as a Failure.
+
+    Each `Exception` and each SystemExit of the service becomes a Failure; none is raised.
 
     Args:
-        registry: The services on offer.
-        command: As decoded; its payload takes the service's request type here.
-        clock: Seconds, monotonic; read before and after the service.
-        server: Name of the server in the answer.
-        on_defect: Called with unexpected exceptions of the service, for the server's log.
-        report: Passed to a service that reports progress.
-        received_s: When the command arrived at a server, by *clock*; None leaves the times of the server out
-            of the result.
+        registry: The services of this process.
+        command: The decoded command; its payload is converted to the service's request type here.
+        clock: Returns monotonic seconds; read before and after the call of the service.
+        server: Name of this server, which the answer states.
+        on_defect: Called with the command and each exception of the service that is no `RsePfError`, for the
+            server's log.
+        report: Passed to a service that takes ``report``; None calls it without.
+        received_s: When the command arrived at a server, by *clock*.  None leaves ``queue_ms``,
+            ``received_s`` and ``sent_s`` of the result at 0, as for a command that a robot computes itself.
     """
     started = clock()
     try:
@@ -177,7 +196,7 @@ def dispatch(
 
 
 def unknown_service(name: str, offered: Iterable[str]) -> UnknownService:
-    """Return the error that *name* is none of the services *offered*."""
+    """Return the error for a command whose service *name* is none of the names *offered*."""
     return UnknownService(
         f"no service named {name!r}; this server offers {', '.join(offered) or 'none to you'}",
         hint="check the spelling, or install the service on the server",
@@ -185,7 +204,10 @@ def unknown_service(name: str, offered: Iterable[str]) -> UnknownService:
 
 
 def failure_of(error: RsePfError, command: Command | None = None, *, server: str = "") -> Failure:
-    """Return *error* as the message to a robot."""
+    """Return the message that reports *error* to a robot.
+
+    It has the id and the trace of *command*; without *command* it concerns the whole session.
+    """
     return Failure(
         id=None if command is None else command.id,
         code=error.code,
@@ -198,7 +220,11 @@ def failure_of(error: RsePfError, command: Command | None = None, *, server: str
 
 
 def request_of(payload: Any, service: Service) -> Any:
-    """Return a command's *payload* as the request type of *service*; raises BadRequest."""
+    """Return a command's *payload* converted to the request type of *service*; None counts as empty.
+
+    Raises:
+        BadRequest: The payload does not fit the request type.
+    """
     if type(payload) is service.request_type:
         return payload
     try:
@@ -210,6 +236,12 @@ def request_of(payload: Any, service: Service) -> Any:
 
 
 def _signature(name: str, function: Callable[..., Any], kind: Kind) -> tuple[type[Any], type[Any]]:
+    """Return the request type and the reply type of *function* by its annotations.
+
+    Raises:
+        ConfigurationError: *function* does not take one `msgspec.Struct` and return one, apart from the
+            keyword-only ``report`` of a long service.
+    """
     try:
         hints = typing.get_type_hints(function)
     except (NameError, TypeError, AttributeError) as error:

@@ -38,22 +38,29 @@ __all__ = [
     "show_progress",
 ]
 
+# Unicode categories of characters that are escaped: control, format, surrogate, private use, unassigned, line
+# separator and paragraph separator.
 _HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
-# Letters, marks and symbols that are drawn as nothing, although their category does not say so.
+# Letters, marks and symbols that are escaped because they are drawn as nothing; their category is another.
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0000-\U000e0fff]"
 )
+# The escapes of these characters, in place of the numeric escapes \x0a, \x0d and \x09.
 _SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
+# A character that may need an escape: anything but printable ASCII.
 _NOT_ASCII = re.compile(r"[^\x20-\x7e]")
+# Begins the second and each further line of an error message, so that it cannot look like another report.
 _CONTINUED = "  | "
+# Moves the cursor of a terminal to the start of the line, and clears the line.
 _CLEAR_LINE = "\r\033[K"
 
 
 def printable(text: str) -> str:
-    r"""Return *text* with every character that is not simply drawn as its escape, such as ``\x1b``.
+    r"""Return *text* with an escape such as ``\x1b`` in place of each character that is not visible.
 
     Escaped are control, format, private, unassigned and invisible characters, surrogates, and all separators
-    of lines.  An escaped text is returned as it is, so that escaping twice changes nothing.
+    of lines, among them the newline.  The result contains no such character, so escaping it again changes
+    nothing.
     """
     if text.isascii() and text.isprintable():
         return text
@@ -66,27 +73,30 @@ def counted(number: float, noun: str, plural: str = "") -> str:
 
 
 def format_time(time_s: float) -> str:
-    """Return a Unix time as date and time in UTC."""
+    """Return the Unix time *time_s* (seconds) as date and time in UTC, such as ``2024-05-01 12:00:00Z``."""
     return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(time_s))
 
 
 def show(*lines: str, error: bool = False) -> None:
-    """Write lines to standard output, each on one line whatever it holds.
+    """Write each of *lines* as one line to standard output; hidden characters are escaped by `printable`.
 
     Args:
-        *lines: Without the newlines that end them; a newline inside a line is escaped.
-        error: Write to standard error instead.
+        *lines: The lines without a newline at their end; a newline inside a line is escaped, too.
+        error: Whether to write to standard error instead.
     """
     _write(sys.stderr if error else sys.stdout, "".join(f"{printable(line)}\n" for line in lines))
 
 
 def show_page(text: str) -> None:
-    """Write a text of several lines to standard output; no part that a robot sent may hold a line break."""
+    """Write *text* of several lines to standard output, each line as by `show`.
+
+    The line breaks of *text* are kept, so a text that a robot sent must not be part of it unescaped.
+    """
     show(*text.removesuffix("\n").split("\n"))
 
 
 def show_json(value: Any, *, indent: int | None = None, sort_keys: bool = False) -> None:
-    """Write *value* to standard output as JSON in ASCII; what JSON cannot hold is written as text."""
+    """Write *value* to standard output as JSON in ASCII; values that JSON cannot hold are written as text."""
     _write(sys.stdout, json.dumps(value, indent=indent, sort_keys=sort_keys, default=str) + "\n")
 
 
@@ -96,15 +106,20 @@ def show_error(error: RsePfError) -> None:
 
 
 def error_lines(error: RsePfError) -> list[str]:
-    """Return the report on *error* as lines; a message of several lines cannot pass for several reports."""
+    """Return the lines that report *error* to a user: class and message, then the hint.
+
+    Without a hint, the last line is the address of the explanation.  The second and each further line of a
+    message begin with `_CONTINUED`, so that a message cannot imitate another report.
+    """
     first = f"{type(error).__name__}: {error.message}".rstrip("\n").replace("\n", f"\n{_CONTINUED}")
     return [*first.split("\n"), f"  hint: {error.hint}" if error.hint else f"  see: {error.address()}"]
 
 
 def show_progress(text: str, *, is_over: bool) -> bool:
-    """Rewrite the last line of a terminal on standard error with *text*; return whether it is a terminal.
+    """Replace the current line of standard error by *text*, if standard error is a terminal.
 
-    Nothing is written to a file or pipe.
+    With *is_over* a newline follows, so that the next call writes a new line.  Returns whether standard error
+    is a terminal; nothing is written to a file or a pipe.
     """
     if not sys.stderr.isatty():
         return False
@@ -115,7 +130,7 @@ def show_progress(text: str, *, is_over: bool) -> bool:
 
 @contextmanager
 def at_work(text: str) -> Iterator[None]:
-    """Show *text* as the last line of a terminal while the body works, and clear it at its end."""
+    """Show *text* and "..." on the current line of a terminal while the body runs; then clear the line."""
     show_progress(f"{text} ...", is_over=False)
     try:
         yield
@@ -124,11 +139,12 @@ def at_work(text: str) -> Iterator[None]:
 
 
 def json_line(value: Any, encode: Callable[[Any], bytes]) -> bytes:
-    """Return *value* as JSON on one line, without a newline, in which nothing needs escaping any more.
+    """Return *value* as one line of JSON without a newline, with hidden characters as JSON escapes.
 
     Args:
-        value: What JSON can hold.
-        encode: Returns the JSON of a value in UTF-8; this module imports no encoder, to load at once.
+        value: A value that JSON can hold.
+        encode: Returns the JSON of a value in UTF-8.  It is an argument so that this module, which every
+            command imports, need not import an encoder.
     """
     try:
         line = encode(value)

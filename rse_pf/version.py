@@ -8,7 +8,7 @@ __all__ = ["installed_version"]
 
 
 def installed_version() -> str:
-    """Return the version of the installed distribution, "unknown" where rse-pf runs from a plain checkout."""
+    """Return the version of the installed distribution ``rse-pf``; "unknown" if none is installed."""
     try:
         return metadata.version("rse-pf")
     except metadata.PackageNotFoundError:

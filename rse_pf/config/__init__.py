@@ -1,6 +1,6 @@
 """The settings of the platform: one table, its checks, the file they come from and the page about them.
 
-Numbers that an operator may change belong here; what uses them, and what opens a socket, does not.
+Numbers that an operator may change belong here; code that uses them, or opens a socket, does not.
 """
 
 from rse_pf.config.loading import load_settings

@@ -19,39 +19,48 @@ __all__ = [
     "zone_count",
 ]
 
-# Memory of the serverless PnP: with it AWS gives one whole vCPU, and a command uses one.
+# Memory of the Lambda function of the serverless PnP, in MB: the least with which AWS gives a function one
+# whole vCPU.  A command uses one.
 LAMBDA_MEMORY_MB = 1769
-# Memory of the canary's function: a third of a vCPU, with which a start and one pose fit into its time limit.
+# Memory of the canary's Lambda function, in MB: it comes with a third of a vCPU, with which a cold start and
+# one pose fit into the function's time limit.
 CANARY_MB = 512
-# Time between two calls of the canary: one in each period of its alarm.
+# Seconds between two calls of the canary: one call in each period of its alarm.
 CANARY_PERIOD_S = 60
-# Retention of logs: long enough to look into an incident of last month; the audit log has `cloud.audit_days`.
+# Days for which logs are kept: long enough to investigate an incident of the last month.  The audit log is
+# kept for `cloud.audit_days` instead.
 LOG_DAYS = 30
-# An object that was overwritten or deleted can be restored for as long as the logs say who did it.
+# Days for which an object of S3 that was overwritten or deleted can be restored: as long as logs are kept,
+# which show who did it.
 DELETED_DAYS = 30
-# Servers that are never Spot instances: robots have one place to go when AWS takes all others back.
+# Servers that are never Spot instances: robots can connect to one server when AWS reclaims all others.
 ON_DEMAND_SERVERS = 1
-# Size of the volume of a server: Debian, the environment of Python, and the logs of some days.
+# Size of the disk volume of a server, in GB: Debian, the Python environment, and the logs of some days.
 VOLUME_GB = 8
-# Hours without robots after which a deployment is idle: a whole day, so that a night alone parks nothing.
+# Hours without robots and commands after which a deployment is idle: a day, so that a night parks nothing.
 IDLE_HOURS = 24
 ENDPOINT_SERVICES = {"monitoring": "monitor", "autoscaling": "scale modifier"}
-"""The interface endpoints of the VPC: the service of AWS, and the box of Fig. 2 that uses it.
+"""The interface endpoints of the VPC: the AWS service, and the component of the paper's Fig. 2 that uses it.
 
-Without them the agents reach neither the monitor nor the group; S3 has a gateway endpoint, which is free."""
-# Field of an event of the schedule: the least number of servers with which the deployment is resumed.
+Without these endpoints the agents on the servers reach neither CloudWatch nor the Auto Scaling group.  S3 has
+a gateway endpoint instead, which is free."""
+# Field of an event that resumes a parked deployment by schedule: its new minimum number of servers.
 RESUME_FIELD = "min_servers"
 
 
 def zone_count(settings: PlatformSettings) -> int:
-    """Return in how many zones servers and endpoints are; the load balancer always needs two."""
+    """Return the number of availability zones of servers and VPC endpoints: 1 in the profile small, else 2.
+
+    The load balancer always has two.
+    """
     return 1 if settings.cloud.profile == "small" else 2
 
 
 def parks_when_idle(settings: PlatformSettings) -> bool:
-    """Return whether the deployment ends its servers when nobody has used it for `IDLE_HOURS`.
+    """Return whether the deployment terminates its servers when nobody has used it for `IDLE_HOURS`.
 
-    A platform for more than trials, which TLS or a schedule shows, does so only if its operator says so.
+    With ``cloud.idle_action`` "auto" only a deployment for trials does: one without TLS
+    (``cloud.allow_insecure``) and without ``scaling.schedule``.
     """
     if settings.cloud.idle_action == "auto":
         return settings.cloud.allow_insecure and not settings.scaling.schedule.strip()

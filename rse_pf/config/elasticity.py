@@ -22,33 +22,43 @@ __all__ = [
 ]
 
 MOVES_PER_S = 20.0
-"""Robots that a crowded server asks to move each second, so that the others accept them without a queue."""
+"""Robots that a server with too many robots asks to move to other servers each second: few enough that the
+other servers accept their connections without a queue."""
 MOVE_WITHIN_MS = 5000.0
-"""Time that a robot gets to move to another server: reconnecting takes less than one on a bad network."""
+"""Milliseconds that a robot has for its move to another server; reconnecting takes less than a second on a
+bad network."""
 FAST_PERIOD_S = 10
-"""One sample of the fast profile: the shortest period of a high-resolution alarm."""
+"""Seconds of one CPU sample in the scaling profile "fast": the shortest period of a CloudWatch alarm."""
 FAST_SAMPLES = 3
-"""Busy samples in a row before the fast profile grows."""
-# Average CPU below which a fleet without commands is idle; a server without robots needs a few percent.
+"""Consecutive busy samples after which the scaling profile "fast" adds servers."""
+# Average CPU below which a fleet that gets no commands counts as idle: a server without robots uses a few
+# percent.
 IDLE_CPU_PERCENT = 20.0
-# Average CPU below which one server fewer is enough although robots send commands; `scaling.underused_s`.
+# Average CPU below which a server is removed although robots send commands, if the average stays below for
+# `scaling.underused_s`.
 UNDERUSED_CPU_PERCENT = 15.0
 
 _TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")
+"""The form of the name of an EC2 instance type: family, dot, size."""
 _ARM = re.compile(r"a1|[a-z]+[0-9]+[a-z]*g[a-z]*")
-"""Families of ARM processors: the letter g after the generation, such as m7g, c6gn and t4g."""
+"""EC2 families with ARM processors: a letter g follows the generation, as in m7g, c6gn and t4g."""
 
 
 def instance_types(preferred: str, others: str) -> tuple[str, ...]:
-    """Return the EC2 types of a backend server, the *preferred* one first, each once.
+    """Return the EC2 instance types of a backend server: *preferred*, then *others*, without duplicates.
 
-    The *others* are separated by spaces.
+    The names in *others* are separated by spaces.
     """
     return tuple(dict.fromkeys((preferred, *others.split())))
 
 
 def check_elasticity(scaling: Mapping[str, Any], cloud: Mapping[str, Any]) -> None:
-    """Raise SettingsError if two settings of *scaling* and *cloud*, by name, cannot both hold."""
+    """Raise SettingsError if settings of the groups *scaling* and *cloud* are malformed or contradictory.
+
+    Args:
+        scaling: The settings of the group ``scaling``, by name.
+        cloud: The settings of the group ``cloud``, by name.
+    """
     types = instance_types(cloud["instance_type"], cloud["other_instance_types"])
     _check_periods(scaling)
     if scaling["underused_s"] and scaling["busy_cpu_percent"] < 2 * UNDERUSED_CPU_PERCENT:
@@ -84,6 +94,7 @@ def check_elasticity(scaling: Mapping[str, Any], cloud: Mapping[str, Any]) -> No
 
 
 def _check_periods(scaling: Mapping[str, Any]) -> None:
+    """Raise SettingsError if ``scaling.idle_s`` is not a multiple of the period of a CPU sample."""
     fast = scaling["profile"] == "fast"
     period_s = FAST_PERIOD_S if fast else scaling["period_s"]
     if scaling["idle_s"] % period_s:

@@ -13,10 +13,13 @@ __all__ = ["load_settings"]
 
 
 def load_settings(path: Path | None = None) -> PlatformSettings:
-    """Read ``context."rse-pf"`` of *path*, by default ``./cdk.json``, else the built-in defaults.
+    """Return the built-in defaults with the overrides in ``context."rse-pf"`` of the JSON file *path*.
+
+    Without *path* the file is ``./cdk.json``; if that file does not exist, the defaults are returned.
 
     Raises:
-        SettingsError: The file is named but missing, is not JSON, or holds a bad or misplaced setting.
+        SettingsError: The file cannot be read or is not JSON, or it holds a setting that is unknown, invalid
+            or outside of ``context."rse-pf"``.
     """
     chosen = path or Path("cdk.json")
     if path is None and not chosen.exists():

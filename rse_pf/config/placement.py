@@ -18,7 +18,8 @@ from rse_pf.errors import SettingsError
 __all__ = ["ServerPlacement", "fixed_live_ports", "is_loopback", "live_ports"]
 
 _ELSEWHERE = {"store": ("data", "store"), "live_host": ("live", "host")}
-"""Fields that are no settings of the group serving: their groups and names there."""
+"""Group and name of the setting of each placement field that is not in the group ``serving``."""
+# Member of a settings file that holds a placement.
 _FILE_KEY = "placement"
 
 
@@ -26,8 +27,8 @@ _FILE_KEY = "placement"
 class ServerPlacement:
     """The addresses, processes and object store of one backend server.
 
-    Each field is a setting of the same name of the group serving, but for ``store`` (data.store) and
-    ``live_host`` (live.host); port 0 takes a free one, workers 0 means one for each core.
+    Each field replaces the setting with its name in the group ``serving``, except ``store`` (``data.store``)
+    and ``live_host`` (``live.host``).  Port 0 takes a free port; 0 workers are one worker for each core.
     """
 
     host: str
@@ -40,17 +41,21 @@ class ServerPlacement:
 
     @classmethod
     def of(cls, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
-        """Return the placement that *settings* describe, with *changes*; raises SettingsError."""
+        """Return the placement in *settings*, with the fields in *changes* replaced; raises SettingsError."""
         placed = _placed(settings, changes)
         groups = {name: _ELSEWHERE.get(name, ("serving", name)) for name in cls.__slots__}
         return cls(**{name: getattr(getattr(placed, group), of) for name, (group, of) in groups.items()})
 
     @classmethod
     def read(cls, file: Path | None, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
-        """Return the placement in a settings file with *changes*; *settings* say the rest.
+        """Return the placement in the settings file *file*, with the fields in *changes* replaced.
+
+        A field that neither the file nor *changes* holds has its value in *settings*; without *file*, so do
+        all fields that are not in *changes*.
 
         Raises:
-            SettingsError: The file cannot be read, or holds a value that no such setting may have.
+            SettingsError: The file cannot be read, has an unknown field, or holds a value that its setting
+                may not have.
         """
         if file is None:
             return cls.of(settings, **changes)
@@ -67,18 +72,19 @@ class ServerPlacement:
         return cls.of(settings, **{**placed, **changes})
 
     def apply(self, settings: PlatformSettings) -> PlatformSettings:
-        """Return *settings* as they are for this server."""
+        """Return *settings* with the values of this placement, as the server itself uses them."""
         return _placed(settings, asdict(self))
 
     def document(self, settings: PlatformSettings) -> dict[str, Any]:
-        """Return the content of a settings file for servers with this placement, as plain JSON values."""
+        """Return the content of a settings file with *settings* and this placement, as plain JSON values."""
         return {"context": {"rse-pf": settings.to_dict()}, _FILE_KEY: asdict(self)}
 
 
 def live_ports(live: LiveSettings) -> range:
-    """Return the ports on which the map servers of live maps listen on ``live.host``; 0 takes a free one.
+    """Return the ports among which each map server of a live map chooses one on ``live.host``.
 
-    If other machines connect, the ports are fixed, so that a firewall can name them.
+    If ``live.host`` is a loopback address, or ``live.first_port`` is 0, the only entry is port 0: any free
+    port.  Otherwise the ports are fixed, so that a firewall can name them.
     """
     if is_loopback(live.host) or not live.first_port:
         return range(1)
@@ -86,7 +92,10 @@ def live_ports(live: LiveSettings) -> range:
 
 
 def fixed_live_ports(live: LiveSettings) -> range:
-    """Return the ports of `live_ports` where other machines connect; ``live.first_port`` is not 0."""
+    """Return the `LIVE_PORTS` ports from ``live.first_port`` on, for servers that other machines connect to.
+
+    ``live.first_port`` must not be 0.
+    """
     return range(live.first_port, live.first_port + LIVE_PORTS)
 
 
@@ -103,6 +112,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _placed(settings: PlatformSettings, changes: dict[str, Any]) -> PlatformSettings:
+    """Return *settings* with the placement fields *changes*, by name; raises SettingsError."""
     groups: dict[str, dict[str, Any]] = {}
     for name, value in changes.items():
         group, of = _ELSEWHERE.get(name, ("serving", name))

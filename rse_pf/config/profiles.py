@@ -1,4 +1,7 @@
-"""What a profile sets that the operator did not set: other defaults for a deployment of another size."""
+"""Profiles of deployments: other defaults for the settings of a deployment of another size.
+
+A setting that the operator sets is not changed by a profile.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,14 @@ PROFILES: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     # The smallest fleet that serves: one burstable server, so CPU above its credits costs extra.
     "small": {"scaling": {"min_servers": 1}, "cloud": {"instance_type": "t3a.medium"}},
 }
-"""``cloud.profile`` to group to setting to its default there."""
+"""By value of ``cloud.profile``, group and name: the settings with another default in this profile."""
 
 
 def with_profile(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return *overrides* with the defaults of the profile that they name; what they set stays."""
+    """Return *overrides* completed by the defaults of the profile that their ``cloud.profile`` names.
+
+    A setting in *overrides* keeps its value.  An unknown profile adds nothing.
+    """
     cloud = overrides.get("cloud")
     name = cloud.get("profile") if isinstance(cloud, Mapping) else None
     made = dict(overrides)

@@ -16,11 +16,11 @@ _HEAD = """# Settings
 """
 _TABLE = "| Setting | Default | Allowed | Meaning |\n|---|---|---|---|\n"
 _OWN_CHOICE = "ours"
-"""The source of a value that this project chose; the page names all other sources."""
+"""``SettingRow.source`` of a value that this project chose; the page shows every other source."""
 
 
 def settings_page() -> str:
-    """Return the page: every setting with default, unit, range and meaning, and the source of a value."""
+    """Return the page ``docs/settings.md``: default, unit, range, meaning and source of each setting."""
     page, group = _HEAD, ""
     for row in setting_rows():
         if row.group != group:
@@ -37,6 +37,7 @@ def settings_page() -> str:
 
 
 def _allowed(row: SettingRow) -> str:
+    """Return the choices or the range of a setting as text, "" if every value of its type is allowed."""
     if row.choices:
         return ", ".join(f"`{choice}`" for choice in row.choices)
     if row.low is None and row.high is None:

@@ -31,17 +31,19 @@ __all__ = [
 DEPLOYMENT_TAG = "rse-pf"
 """Key of the tag of every resource; its value is `ResourceNames.prefix`."""
 HEALTH_PATH = "/healthz"
-"""Health check of the robots' port, without a token: it shows only that robots are served.  Below ``/data``
-it is the health check of the data service."""
+"""Path of the health check of the robots' port, which needs no token; it shows only whether robots can
+connect.  Below ``/data`` it is the health check of the data service."""
 READY_PATH = "/readyz"
-"""Readiness check of the control port by load balancers.  Below ``/data`` it shows whether the store of the
-data service answers; agents publish this, and no server is replaced because of it."""
+"""Path of the readiness check of the control port, which load balancers request.  Below ``/data`` it shows
+whether the object store of the data service answers; agents publish this as a metric, and no server is
+replaced because of it."""
 ROBOTS_PATH = "/ws"
 """Path of the robots' WebSocket."""
 ROSBRIDGE_PATH = "/rosbridge"
-"""Path of rosbridge clients at the load balancer, if ``serving.rosbridge`` is set."""
+"""Path at the load balancer to which rosbridge clients connect, if ``serving.rosbridge`` is set."""
 ROSBRIDGE_PORT = 8768
-"""Port of the rosbridge server on a backend server; 9090 of rosbridge_suite is often taken on a robot."""
+"""Port of the rosbridge server on a backend server.  It is not 9090, the port of rosbridge_suite, which is
+often in use on a robot."""
 KEYS_NAME = "keys.json"
 """Name of the object in the artifact bucket that holds the public key set."""
 ROBOTS_NAME = "control/robots.json"
@@ -49,69 +51,76 @@ ROBOTS_NAME = "control/robots.json"
 DENY_NAME = "control/deny.json"
 """Name of the object in the artifact bucket that holds the list of refused robots and tokens."""
 JOURNAL_PREFIX = "journals"
-"""Prefix of the journals of servers in the artifact bucket; each instance has a folder below it."""
+"""Prefix of the journals (logs) of servers in the artifact bucket; each instance has a folder below it."""
 SERVICES_PREFIX = "services"
 """Prefix of the published services in the artifact bucket: their list and their archives."""
 VERSION_PARAMETER = "ServersVersion"
 """Parameter of the backend stack that holds the version of the launch template that servers run."""
 AUDIT_PREFIX = "audit"
-"""Prefix of the pieces of audit logs in their bucket."""
+"""Prefix of the objects that hold audit logs in their bucket."""
 STACKS = ("Network", "Data", "Backend", "Serverless", "Observability")
-"""The boxes that are stacks, in an order in which they can be deployed."""
+"""The CloudFormation stacks of a deployment without their prefix, in an order in which they can be
+deployed."""
 
 SETTINGS_CONTEXT = "rse-pf:settings"
-"""Key of the CDK's context that names the file of settings, if that is not cdk.json."""
+"""Key of the CDK's context whose value is the path of the settings file, if that is not cdk.json."""
 
-
-_DEFAULT_QUALIFIER, _DEFAULT_TOOLKIT = "hnb659fds", "CDKToolkit"
+# Qualifier with which ``cdk bootstrap`` prepares an account if no other is given.
+_DEFAULT_QUALIFIER = "hnb659fds"
+# Name of the stack that ``cdk bootstrap`` makes with this qualifier.
+_DEFAULT_TOOLKIT = "CDKToolkit"
 
 
 def toolkit_stack(qualifier: str) -> str:
-    """Return the name of the stack that the CDK's bootstrap with *qualifier* makes.
+    """Return the name of the CloudFormation stack that ``cdk bootstrap`` makes for *qualifier*.
 
-    The CDK's own name belongs to the CDK's own qualifier: a bootstrap under it with another one would delete
-    the roles by which the other applications of the account deploy.
+    It is ``CDKToolkit`` for the CDK's default qualifier only, else ``CDKToolkit-QUALIFIER``.  A bootstrap of
+    ``CDKToolkit`` with another qualifier would delete the roles with which other applications of the account
+    are deployed.
     """
     return _DEFAULT_TOOLKIT if qualifier == _DEFAULT_QUALIFIER else f"{_DEFAULT_TOOLKIT}-{qualifier}"
 
 
 @dataclass(frozen=True, slots=True)
 class ResourceNames:
-    """The names in AWS of one deployment; *deployment* is ``cloud.name``, empty for the only one.
+    """The names of the AWS resources of one deployment; *deployment* is ``cloud.name``, which may be empty.
 
-    No name of one deployment is a name of another; therefore none may be called ``jobs`` or ``...-jobs``.
+    The resources of two deployments never have the same name.
     """
 
     deployment: str = ""
 
     @property
     def prefix(self) -> str:
-        """Return what the names of groups and hooks begin with, and the tag's value: ``rse-pf-lab``."""
+        """Return the beginning of the names of resources, and the value of their tag, such as ``rse-pf-lab``.
+
+        It is ``rse-pf`` for the deployment without a name.
+        """
         return f"rse-pf-{self.deployment}" if self.deployment else "rse-pf"
 
     @property
     def stack_prefix(self) -> str:
-        """Return what the names of the stacks begin with, such as ``RsePf-lab-``."""
+        """Return the beginning of the names of the stacks, such as ``RsePf-lab-``."""
         return f"RsePf-{self.deployment}-" if self.deployment else "RsePf-"
 
     @property
     def group(self) -> str:
-        """Return the name of the Auto Scaling group; fixed, so that an instance knows it beforehand."""
+        """Return the name of the Auto Scaling group, which an instance knows without a request."""
         return self.prefix
 
     @property
     def drain_hook(self) -> str:
-        """Return the name of the lifecycle hook that an instance completes when its robots are gone."""
+        """Return the name of the lifecycle hook that an instance completes when its robots have left."""
         return f"{self.prefix}-drain"
 
     @property
     def launch_hook(self) -> str:
-        """Return the name of the lifecycle hook that an instance completes when it is ready."""
+        """Return the name of the lifecycle hook that an instance completes when it can serve robots."""
         return f"{self.prefix}-launch"
 
     @property
     def dashboard(self) -> str:
-        """Return the name of the dashboard."""
+        """Return the name of the CloudWatch dashboard."""
         return self.prefix
 
     @property
@@ -121,17 +130,17 @@ class ResourceNames:
 
     @property
     def function(self) -> str:
-        """Return the name of the function that computes poses."""
+        """Return the name of the Lambda function of the serverless PnP."""
         return f"{self.prefix}-pnp"
 
     @property
     def canary(self) -> str:
-        """Return the name of the function that asks for a known pose, and of its robot."""
+        """Return the name of the canary: of its Lambda function, and of the robot as which it connects."""
         return f"{self.prefix}-canary"
 
     @property
     def budget(self) -> str:
-        """Return the name of the budget."""
+        """Return the name of the AWS budget."""
         return f"{self.prefix}-budget"
 
     @property
@@ -140,20 +149,24 @@ class ResourceNames:
         return self.parameter("parked")
 
     def stack(self, box: str) -> str:
-        """Return the name of the stack *box*, such as ``RsePf-lab-Backend``."""
+        """Return the name of the stack *box*, one of `STACKS`, such as ``RsePf-lab-Backend``."""
         return f"{self.stack_prefix}{box}"
 
     def owns_stack(self, name: str) -> bool:
-        """Return whether *name* is of a stack, or of what CloudFormation named after one, of this deployment.
+        """Return whether *name* is a stack of this deployment, or a resource that is named after a stack.
 
-        A box begins with a capital letter and a deployment does not: RsePf-Data is none of ``lab``.
+        After `stack_prefix` the name of a stack begins with a capital letter, which the name of a deployment
+        does not: ``RsePf-lab-Data`` belongs to the deployment ``lab``, not to the one without a name.
         """
         rest = name.removeprefix(self.stack_prefix)
         return rest != name and rest[:1].isupper()
 
     @property
     def alarm_prefix(self) -> str:
-        """Return what the names of alarms begin with; the slash keeps those of other deployments apart."""
+        """Return the beginning of the names of this deployment's alarms, such as ``rse-pf-lab/``.
+
+        It ends with a slash, so that it is no beginning of an alarm name of another deployment.
+        """
         return f"{self.prefix}/"
 
     def alarm(self, name: str) -> str:

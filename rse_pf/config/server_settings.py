@@ -1,7 +1,7 @@
-"""Which settings a backend server on AWS reads: only these travel in its package.
+"""The settings that a backend server on AWS reads: only these are in the package that it installs.
 
-Servers whose package has an equal digest are not replaced.  So a price, the threshold of an alarm or the
-size of the fleet changes templates and leaves the servers alone.
+A deployment replaces servers only if the digest of their package has changed.  A change of other settings,
+such as a price, the threshold of an alarm or the size of the fleet, therefore replaces no server.
 """
 
 from __future__ import annotations
@@ -25,16 +25,18 @@ READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
     "health": ("unhealthy_checks",),
     "local": ("start_timeout_s",),
 }
-"""Of these groups the named settings; of every other group all settings."""
+"""By group of settings: the names of the settings that a server reads.  Of a group that is not a key here, a
+server reads all settings."""
 
 
 def server_settings(settings: PlatformSettings) -> dict[str, dict[str, Any]]:
-    """Return what a server reads of *settings*, as plain JSON values by group.
+    """Return the settings of *settings* that a server reads, as plain JSON values by group and name.
 
-    `PlatformSettings.from_dict` accepts it; what is left out has its default there and is not read.
+    `PlatformSettings.from_dict` accepts the result; it gives the default to each setting that is left out,
+    which no server reads.
 
     Raises:
-        SettingsError: The parts that travel contradict a default of those that do not.
+        SettingsError: The result contradicts the default of a setting that is left out.
     """
     whole = settings.to_dict()
     chosen = {
@@ -46,7 +48,7 @@ def server_settings(settings: PlatformSettings) -> dict[str, dict[str, Any]]:
         for group in dataclasses.fields(PlatformSettings)
     }
     chosen["burst"]["url"] = settings.burst.url or BURST_PATH  # the function is behind the load balancer
-    # No server reads it, but it has to be a multiple of the period, whatever that is.
+    # No server reads scaling.idle_s, but `PlatformSettings` accepts only a multiple of scaling.period_s.
     chosen["scaling"]["idle_s"] = settings.scaling.period_s * 60
     PlatformSettings.from_dict(chosen)
     return chosen

@@ -1,4 +1,4 @@
-"""What a setting consists of, and why its value may be refused: unknown, of the wrong type, out of range.
+"""Declare a setting, and check its value: its type, its range, and the form of texts.
 
 Every error names the setting, the value and its limit, and says what to do.
 """
@@ -28,13 +28,21 @@ __all__ = [
     "typed",
 ]
 
+# Largest absolute value of a number in the settings: whole numbers up to it are exact as float64.
 _LARGEST = 1e15
+# ``cloud.name``: empty, or at most 16 lower-case letters, digits and hyphens.
 _DEPLOYMENT = re.compile(r"(?:[a-z](?:[a-z0-9-]{0,14}[a-z0-9])?)?")
+# ``cloud.bootstrap_qualifier`` as the CDK accepts it.
 _QUALIFIER = re.compile(r"[a-z0-9]{1,10}")
+# The origin of a web page: scheme, host or IPv6 address, and perhaps a port.
 _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://(?:[a-z0-9._-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?", re.IGNORECASE)
+# ``burst.url``: an HTTP address with a path, or a path alone.
 _BURST_URL = re.compile(r"(?:https?://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?)?/[!-~]{0,200}")
+# The length of the prefix at the end of a CIDR range.
 _PREFIX = re.compile(r"/[0-9]{1,2}$")
+# The name of an S3 bucket.
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+# Where an operator changes a setting; part of the hints of errors.
 WHERE = 'in cdk.json, context."rse-pf"'
 
 
@@ -48,7 +56,17 @@ def setting(
     high: float | None = None,
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """Declare one setting; the docs table, the CLI and the checks all come from here."""
+    """Declare one setting as a dataclass field; the reference page, the CLI options and the checks use it.
+
+    Args:
+        default: The value if the operator sets none.
+        doc: The meaning of the value, for the reference page and the help of the CLI.
+        unit: The unit of the value, "" if it has none.
+        source: Where the default comes from, such as a section of the paper; "ours" if this project chose it.
+        low: The smallest allowed value; None for no bound.
+        high: The largest allowed value; None for no bound.
+        choices: The allowed values; empty if all values in the range are allowed.
+    """
     metadata = {
         "doc": doc, "unit": unit, "source": source, "low": low, "high": high, "choices": choices,
     }  # fmt: skip
@@ -57,7 +75,7 @@ def setting(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingRow:
-    """One setting as a row of the documentation."""
+    """One setting as a row of the reference page; the fields are those of `setting`, with the value."""
 
     group: str
     name: str
@@ -72,7 +90,11 @@ class SettingRow:
 
 
 def typed(name: str, value: Any, kind: Any) -> Any:
-    """Return *value* as *kind*, a whole number as a float where one is meant; raises SettingsError."""
+    """Return *value* if its type is *kind*; a whole number becomes a float if *kind* is float.
+
+    Raises:
+        SettingsError: *value* has another type, or is a number that is not finite or beyond ``1e15``.
+    """
     if kind in (int, float) and type(value) in (int, float) and not abs(value) <= _LARGEST:
         raise SettingsError(f"{name} is not a finite number below {_LARGEST:g}", hint=f"correct it {WHERE}")
     if kind is float and type(value) is int:
@@ -93,7 +115,7 @@ def _shown(value: Any) -> str:
 
 
 def check_range(row: SettingRow) -> None:
-    """Raise SettingsError if the value of *row* is not among its choices or out of its range."""
+    """Raise SettingsError if the value of *row* is not one of its choices, or is out of its range."""
     if row.choices and row.value not in row.choices:
         raise SettingsError(
             f"{row.group}.{row.name} = {row.value!r} is not one of {', '.join(row.choices)}",
@@ -110,7 +132,10 @@ def check_range(row: SettingRow) -> None:
 
 
 def check_origin(name: str, origin: str) -> None:
-    """Raise SettingsError if *origin* is not one that a browser sends: a scheme, a host, perhaps a port."""
+    """Raise SettingsError if *origin* has not the form of the header Origin: scheme, host, perhaps a port.
+
+    *name* is the name of the setting.
+    """
     if _ORIGIN.fullmatch(origin) is None:
         raise SettingsError(
             f"{name} has {_shown(origin)}, which is no origin of a web page",
@@ -119,7 +144,7 @@ def check_origin(name: str, origin: str) -> None:
 
 
 def check_burst_url(name: str, url: str) -> None:
-    """Raise SettingsError if *url* is neither empty, nor a path, nor an address of HTTP."""
+    """Raise SettingsError if *url*, the setting *name*, is neither empty, nor a path, nor an HTTP address."""
     if url and _BURST_URL.fullmatch(url) is None:
         raise SettingsError(
             f"{name} = {_shown(url)} is no place to send commands to",
@@ -128,7 +153,7 @@ def check_burst_url(name: str, url: str) -> None:
 
 
 def check_cidr(name: str, cidr: str) -> None:
-    """Raise SettingsError if *cidr* is not a range of IPv4 addresses with the length of its prefix."""
+    """Raise SettingsError if *cidr*, the setting *name*, is not an IPv4 range such as ``192.0.2.0/24``."""
     try:
         if _PREFIX.search(cidr) is None:
             raise ValueError
@@ -141,7 +166,7 @@ def check_cidr(name: str, cidr: str) -> None:
 
 
 def check_buckets(name: str, buckets: str) -> None:
-    """Raise SettingsError if *buckets*, with spaces between, holds a name that no bucket of S3 has."""
+    """Raise SettingsError if *buckets*, separated by spaces, holds a name that no S3 bucket can have."""
     for bucket in buckets.split():
         if _BUCKET.fullmatch(bucket) is None:
             raise SettingsError(
@@ -151,7 +176,12 @@ def check_buckets(name: str, buckets: str) -> None:
 
 
 def check_deployment(name: str, qualifier: str) -> None:
-    """Raise SettingsError if AWS would not take ``cloud.name`` or ``cloud.bootstrap_qualifier`` in a name."""
+    """Raise SettingsError if AWS would refuse resource names that hold *name* or *qualifier*.
+
+    Args:
+        name: The setting ``cloud.name``.
+        qualifier: The setting ``cloud.bootstrap_qualifier``.
+    """
     if _DEPLOYMENT.fullmatch(name) is None:
         raise SettingsError(
             f"cloud.name = {_shown(name)} is no name of a deployment",
@@ -165,7 +195,10 @@ def check_deployment(name: str, qualifier: str) -> None:
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return a hint: the known name that is close to *name*, else *otherwise* or all of them."""
+    """Return a hint for the unknown *name*: the name in *known* that is most similar to it.
+
+    If none is similar, the hint is *otherwise* or, if that is empty, the list of all names in *known*.
+    """
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {close[0]}?" if close else otherwise or f"known are {', '.join(known)}"
