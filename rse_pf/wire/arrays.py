@@ -20,23 +20,30 @@ from rse_pf.errors import BadMessage, BadRequest
 __all__ = ["Array", "binary_encode_hook", "decode_hook", "extension_hook", "json_encode_hook", "reshaped"]
 
 Array = np.ndarray
-"""Annotation of an array field of a message; ``(n,)`` on the wire, row-major."""
+"""Annotation of an array field of a message; an array travels flat, in row-major order."""
 
+# By type number of a MessagePack extension: the type of the array's elements.
 _EXTENSIONS: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<u4"), 3: np.dtype("<f8")}
-_F4, _U4, _F8 = 1, 2, 3
+_F4 = 1  # extension of a float32 array
+_U4 = 2  # extension of a uint32 array
+_F8 = 3  # extension of a float64 array
 _IS_LITTLE_ENDIAN = sys.byteorder == "little"
+# The extension of each element type that needs no conversion on a little-endian machine.
 _KINDS = {np.dtype(np.float32): _F4, np.dtype(np.uint32): _U4, np.dtype(np.float64): _F8}
 
 
 def json_encode_hook(value: Any) -> Any:
-    """Return *value* as JSON can represent it: arrays become flat lists."""
+    """Return a numeric array as a flat list for JSON; raises BadMessage for any other type."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value.tolist() if value.ndim == 1 else value.ravel().tolist()
     raise _unknown_type_error(value)
 
 
 def binary_encode_hook(value: Any) -> Any:
-    """Return the MessagePack extension of an array: float32, uint32 if it fits, else float64."""
+    """Return a numeric array as a MessagePack extension; raises BadMessage for any other type.
+
+    A float32 array stays float32, integers become uint32 if all of them fit, and all else becomes float64.
+    """
     if isinstance(value, np.ndarray):
         kind = _KINDS.get(value.dtype)
         if kind is not None and _IS_LITTLE_ENDIAN:
@@ -49,7 +56,11 @@ def binary_encode_hook(value: Any) -> Any:
 
 
 def extension_hook(kind: int, data: memoryview) -> npt.NDArray[Any]:
-    """Return the array of one MessagePack extension."""
+    """Return the array in the *data* of a MessagePack extension with the type number *kind*.
+
+    Raises:
+        BadMessage: The type number is unknown, or the data hold a part of a number.
+    """
     dtype = _EXTENSIONS.get(kind)
     if dtype is None:
         raise BadMessage(
@@ -64,7 +75,11 @@ def extension_hook(kind: int, data: memoryview) -> npt.NDArray[Any]:
 
 
 def decode_hook(kind: type[Any], value: Any) -> Any:
-    """Return *value* as a flat float64 array of finite numbers."""
+    """Return *value*, the decoded field of a message with the annotation *kind*, as a flat float64 array.
+
+    Raises:
+        BadMessage: *kind* is not `Array`, or *value* is not an array or list of finite numbers.
+    """
     if kind is not np.ndarray:
         raise BadMessage(f"{kind.__name__} cannot be encoded in a message")
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
@@ -74,7 +89,7 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
         array = _from_list(value)
     else:
         raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
-    # The sum of squares is finite only if every number is; vdot overflows without a warning.
+    # The sum of squares is finite only if every number is finite; vdot overflows without a warning.
     if not math.isfinite(np.vdot(array, array)):
         raise BadMessage("an array holds a number that is not finite or out of range", hint="leave it out")
     return array
@@ -95,7 +110,10 @@ def reshaped(name: str, array: npt.NDArray[np.float64], columns: int) -> npt.NDA
 
 
 def _from_list(numbers: list[Any]) -> npt.NDArray[np.float64]:
-    """Return a list of numbers as an array, by two loops in C; strings and booleans are refused."""
+    """Return a list of numbers as a float64 array; raises BadMessage for strings, booleans and lists in it.
+
+    The two loops over the list are in C, which is faster than numpy's conversion with a check of types.
+    """
     try:
         floats = msgspec.convert(numbers, list[float])
     except msgspec.ValidationError as error:

@@ -1,6 +1,6 @@
 """Offset between a robot's clock and a server's, and the two one-way delays of the paper's Sect. 3.3.
 
-All four timestamps of an exchange are arguments.
+The caller passes all timestamps; this module reads no clock.
 """
 
 from __future__ import annotations
@@ -14,7 +14,11 @@ __all__ = ["ClockOffset", "Exchange"]
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """One ping: robot sent, server received, server answered, robot received; seconds."""
+    """The four timestamps of a ping and its pong, in seconds.
+
+    ``sent_s`` and ``returned_s`` are readings of the robot's clock, when it sent the ping and received the
+    pong; ``received_s`` and ``answered_s`` are readings of the server's clock.
+    """
 
     sent_s: float
     received_s: float
@@ -23,7 +27,7 @@ class Exchange:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether the timestamps are finite and neither clock ran backwards."""
+        """Whether all timestamps are finite and neither clock ran backwards between its two timestamps."""
         return (
             math.isfinite(self.sent_s + self.received_s + self.answered_s + self.returned_s)
             and self.sent_s <= self.returned_s
@@ -32,19 +36,19 @@ class Exchange:
 
     @property
     def round_trip_s(self) -> float:
-        """Time on the network, both ways together."""
+        """The seconds on the network, both directions together, without the time in the server."""
         return max(0.0, (self.returned_s - self.sent_s) - (self.answered_s - self.received_s))
 
     @property
     def offset_s(self) -> float:
-        """Server clock minus robot clock, if both directions take equally long."""
+        """Server clock minus robot clock in seconds, as if both directions had taken equally long."""
         return ((self.received_s - self.sent_s) + (self.answered_s - self.returned_s)) / 2
 
 
 class ClockOffset:
-    """The offset of the exchange with the shortest round trip among the last few.
+    """Estimates the clock offset by the exchange with the shortest round trip among the last *window*.
 
-    The shortest round trip waited least in queues, so its two directions differ least.
+    This exchange waited least in queues, so the times of its two directions differ least.
 
     Source:
         Mills, RFC 5905 (NTP), Sect. 10: the clock filter.
@@ -54,21 +58,23 @@ class ClockOffset:
         self._window: deque[Exchange] = deque(maxlen=window)
 
     def add(self, exchange: Exchange) -> None:
-        """Take one exchange into account."""
+        """Add *exchange*; the oldest one leaves the window if it is full."""
         self._window.append(exchange)
 
     @property
     def offset_s(self) -> float | None:
-        """Server clock minus robot clock, or None before the first exchange."""
+        """Server clock minus robot clock in seconds, None before the first exchange."""
         return self._best.offset_s if self._window else None
 
     def split_s(
         self, sent_s: float, received_s: float, answered_s: float, returned_s: float
     ) -> tuple[float, float] | tuple[None, None]:
-        """Return the one-way delays of a command and its answer, by the best offset.
+        """Return the one-way delays (s) of a command and of its answer, computed with `offset_s`.
 
-        A delay that the error of the offset makes negative is returned as 0; both are None without an offset
-        or without the server's timestamps.
+        The arguments are timestamps as in `Exchange`, of the command and its answer.  A delay that would be
+        negative, because of the error of the offset, is returned as 0, and the other as the whole time on
+        the network.  Both are None without an offset, or if ``received_s`` and ``answered_s`` are not times
+        of a server.
         """
         offset = self.offset_s
         if offset is None or not 0.0 < received_s <= answered_s:

@@ -1,7 +1,7 @@
-"""Bytes to messages and back: JSON, JSON+zlib (the paper's) and MessagePack with raw arrays.
+"""Encode and decode messages: JSON, JSON with zlib (as in the paper), or MessagePack with raw arrays.
 
-Input is untrusted: limits hold *while* decoding, and only errors of `rse_pf.errors` are raised.  A codec
-keeps no state between messages.
+Input is untrusted: the limits are checked before or while decoding, and only errors of `rse_pf.errors` are
+raised.  A codec keeps no state between messages.
 """
 
 from __future__ import annotations
@@ -48,58 +48,73 @@ SUBPROTOCOLS = {
     "json": "rse-pf.v1.json",
     "bin": "rse-pf.v1.bin",
 }
-"""Short name to WebSocket sub-protocol, in the server's order of preference."""
+"""By name of a codec: its WebSocket sub-protocol."""
 
 CODECS = tuple(SUBPROTOCOLS)
+"""The names of all codecs."""
 _CODEC_NAMES = {protocol: name for name, protocol in SUBPROTOCOLS.items()}
 
-# Level of zlib.  A robot's uplink is slower than its processor: at level 1 a command is 6 % longer.
+# zlib level of a robot's text messages.  A robot's uplink is slower than its processor: at level 1 a command
+# is 6 % longer.
 _LEVEL = 6
-# Level of zlib for decimal numbers, which have few useful repetitions.  Without the short ones, a command of
-# 200 matches is 1.5 % shorter, takes the robot as long, and the server inflates it in two thirds of the time.
+# zlib level of a robot's messages that are mostly decimal numbers, used with the strategy Z_FILTERED.  Short
+# repetitions do not shorten such texts: without them a command of 200 matches is 1.5 % shorter, takes the
+# robot as long, and is inflated by the server in two thirds of the time.
 _LEVEL_OF_NUMBERS = 4
-# A text with at least one number for this many bytes counts as numbers.
+# A text is mostly decimal numbers if it has a comma for at most this many bytes.
 _BYTES_PER_NUMBER = 16
 
-# A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time.
+# zlib level of a server's messages: level 6 would save 5 of 794 bytes, and take a third more time.
 _REPLY_LEVEL = 1
 
-# A shorter reply is stored.  Deflating the reply to 200 matches from 1,520 to 860 bytes, which saves one
-# packet, takes 10 us, which is twice the rest of encoding it.
+# A server's message with fewer bytes is sent as a zlib stream without compression.  Compressing the reply to
+# 200 matches from 1,520 to 860 bytes would save one packet, but take 10 us: twice the rest of its encoding.
 _STORED_BYTES = 2_800
+# First bytes of a zlib stream that consists of one block without compression (RFC 1950 and 1951).
 _STORED_HEAD = b"\x78\x01\x01"
-# Longer messages are inflated by zlib: isal takes 0.4 us for an empty block, which is 5 ms of this size.
+# Compressed messages with more bytes than this are inflated by zlib, not by isal: isal takes 0.4 us for an
+# empty block, so a hostile message of this size takes it 5 ms.
 _MAX_FAST_BYTES = 16_384
 
+# Types of decoded values that hold other values.
 _CONTAINERS = frozenset((dict, list, tuple))
+# Returns whether none of some types is in `_CONTAINERS`.
 _is_flat = _CONTAINERS.isdisjoint
 _FROM_ROBOT = frozenset(get_args(FromRobot))
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, OverflowError)
-"""What decoders raise; a `msgspec.ValidationError` is a DecodeError, a UnicodeDecodeError a ValueError."""
+"""Exceptions that decoders of msgspec raise for invalid bytes, with their subclasses."""
+# Exceptions that encoders of msgspec raise for values that cannot be encoded.
 _UNENCODABLE = (RecursionError, ValueError, TypeError, OverflowError)
 
 
 ReadFirst = Callable[[bytes | bytearray], Command | None]
-"""Returns the command in a message of a robot, inflated; None if it leaves the message to the codec."""
+"""Reads a robot's message (inflated) at less cost than the codec, if it is a command of one certain service.
+
+Returns the command, or None if the codec has to read the message."""
 
 
 class Codec(Protocol):
-    """One encoding of messages."""
+    """Encodes and decodes messages; ``is_text`` is whether they are sent as WebSocket text messages."""
 
     name: str
     is_text: bool
 
     def encode(self, message: Message) -> bytes:
-        """Return the WebSocket message of *message*; raises BadMessage if it cannot be encoded."""
+        """Return *message* as the bytes of a WebSocket message; raises BadMessage if it cannot be encoded."""
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        """Return the message of a robot in *data*; raises BadMessage or LimitExceeded."""
+        """Return the message that a robot sent as *data*; raises BadMessage or LimitExceeded."""
 
     def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
-        """Return the message of a robot, None above *max_bytes*, inflated; raises as `decode_from_robot`."""
+        """Return the message that a robot sent as *data*, None if it has more than *max_bytes* inflated.
+
+        Raises:
+            BadMessage: As for `decode_from_robot`.
+            LimitExceeded: As for `decode_from_robot`.
+        """
 
     def decode_from_server(self, data: bytes) -> FromServer:
-        """Return the message of a server in *data*; raises BadMessage or LimitExceeded."""
+        """Return the message that a server sent as *data*; raises BadMessage or LimitExceeded."""
 
 
 def make_codec(
@@ -112,10 +127,10 @@ def make_codec(
     """Return the codec called *name*: ``zlib``, ``json`` or ``bin``.
 
     Args:
-        name: Which one.
-        limits: What is accepted from the other side.
-        zlib_library: ``zlib``, or ``isal.isal_zlib``.
-        read_first: As in `rse_pf.wire.server_codec.make_server_codec`.
+        name: Name of the codec.
+        limits: Limits of the messages that are decoded; None means the defaults.
+        zlib_library: The module that compresses and inflates short messages: ``zlib`` or ``isal.isal_zlib``.
+        read_first: Reads a robot's message before the codec does; None if only the codec reads messages.
 
     Raises:
         UnsupportedProtocol: There is no such codec.
@@ -129,10 +144,10 @@ def make_codec(
 
 
 def as_type(value: Any, kind: type[T]) -> T:
-    """Return a message's ``payload`` or ``reply`` as *kind*, its arrays as float64.
+    """Return *value*, the ``payload`` or ``reply`` of a message, as the type *kind* with float64 arrays.
 
     Raises:
-        BadMessage: It does not fit.
+        BadMessage: *value* does not fit *kind*.
     """
     try:
         return msgspec.convert(value, kind, dec_hook=arrays.decode_hook)
@@ -143,7 +158,7 @@ def as_type(value: Any, kind: type[T]) -> T:
 
 
 def codec_for(offered: list[str]) -> str | None:
-    """Return the codec name of the first offered sub-protocol that is supported, else None."""
+    """Return the name of the codec of the first supported sub-protocol in *offered*; None if none is."""
     for protocol in offered:
         if protocol in _CODEC_NAMES:
             return _CODEC_NAMES[protocol]
@@ -151,7 +166,7 @@ def codec_for(offered: list[str]) -> str | None:
 
 
 def stored(text: bytes) -> bytes:
-    """Return *text* as a zlib stream that is not deflated.
+    """Return *text* as a zlib stream without compression, which costs little time.
 
     Source:
         RFC 1950, and RFC 1951, Sect. 3.2.4.
@@ -171,7 +186,13 @@ def stored(text: bytes) -> bytes:
 
 
 def deflated(text: bytes, *, mode: int = zlib.Z_FINISH, window_bits: int = zlib.MAX_WBITS) -> bytes:
-    """Return the *text* of a robot as a deflate stream that ends as *mode* says, by default one of zlib."""
+    """Return the *text* of a robot's message as a deflate stream, by default a complete zlib stream.
+
+    Args:
+        text: Its kind, mostly numbers or not, selects the level and the strategy.
+        mode: How the stream ends, a flush mode of zlib.
+        window_bits: ``wbits`` of zlib; a negative value makes a raw deflate stream.
+    """
     are_numbers = text.count(b",") * _BYTES_PER_NUMBER > len(text)
     level, strategy = (
         (_LEVEL_OF_NUMBERS, zlib.Z_FILTERED) if are_numbers else (_LEVEL, zlib.Z_DEFAULT_STRATEGY)
@@ -181,6 +202,8 @@ def deflated(text: bytes, *, mode: int = zlib.Z_FINISH, window_bits: int = zlib.
 
 
 class _JsonCodec:
+    """The codecs ``json`` and, with *is_compressed*, ``zlib``."""
+
     def __init__(
         self,
         limits: SessionSettings,
@@ -245,6 +268,8 @@ class _JsonCodec:
 
 
 class _BinaryCodec:
+    """The codec ``bin``: MessagePack with raw arrays."""
+
     name = "bin"
     is_text = False
 
@@ -282,7 +307,7 @@ class _BinaryCodec:
 
 
 def _decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
-    """Decode *data*, turning every exception of the decoder into `BadMessage`."""
+    """Return what *decode* returns for *data*; an exception of the decoder becomes BadMessage."""
     try:
         return decode(data)
     except RsePfError:
@@ -292,7 +317,7 @@ def _decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
 
 
 def _undecodable_error(error: Exception) -> BadMessage:
-    """Return the error that an exception of a decoder stands for."""
+    """Return the BadMessage that reports *error*, an exception of a decoder."""
     if isinstance(error, msgspec.ValidationError):
         return BadMessage(str(error)[:200], hint="compare it with docs/protocol.md")
     if isinstance(error, (msgspec.DecodeError, UnicodeDecodeError)):
@@ -310,9 +335,12 @@ def _unencodable_error(message: Message, error: Exception) -> BadMessage:
 
 
 def _check_nesting(value: Any, max_depth: int) -> None:
-    """Apply the depth limit of JSON to a decoded value; the message itself is the first level."""
+    """Raise LimitExceeded if *value*, a part of a decoded message, is nested too deeply.
+
+    The message itself is the first of at most *max_depth* levels.
+    """
     if max_depth > 1 and type(value) is dict and _is_flat(map(type, (*value, *value.values()))):
-        return  # as most are; the loop below takes three times as long
+        return  # most values are such flat maps, for which the loop below takes three times as long
     layer = [value] if type(value) in _CONTAINERS else []
     for _ in range(max_depth - 1):
         layer = [

@@ -1,6 +1,6 @@
-"""Payloads that are encoded once and sent many times, which keeps load generators cheap.
+"""Payloads that are encoded once and sent in many commands, so that load generators need little CPU time.
 
-The server decodes the same message as if it had been encoded as a whole.
+A server decodes such a command exactly as one that was encoded as a whole.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from rse_pf.wire.messages import Command
 
 __all__ = ["PreencodedCommand", "encode_command", "encode_payload", "preencode"]
 
-_ENVELOPE_LEVEL = 1  # level of zlib: an envelope has some 100 bytes
-_ENVELOPE_MEMORY = 1  # memory level of zlib, the smallest: the compressor is made for each command
-_HEADER = b"\x78\x9c"  # of a zlib stream (RFC 1950)
-_BEFORE = b',"payload":'  # text of a command before the payload
-_AFTER = b"}"  # text of a command after the payload
+_ENVELOPE_LEVEL = 1  # zlib level for the command without its payload, which has some 100 bytes
+_ENVELOPE_MEMORY = 1  # smallest memory level of zlib: a compressor is made for each command
+_HEADER = b"\x78\x9c"  # first bytes of a zlib stream (RFC 1950)
+_BEFORE = b',"payload":'  # text of a command in JSON before the payload
+_AFTER = b"}"  # text of a command in JSON after the payload
 
 _encode_json = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
 _encode_binary = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
@@ -30,7 +30,11 @@ _encode_binary = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).enc
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreencodedCommand:
-    """An encoded payload; ``deflated`` is empty unless the codec compresses."""
+    """A payload that was encoded for the codec named ``codec``.
+
+    ``encoded`` are its bytes without compression; ``deflated`` are its deflate blocks, empty unless the codec
+    is ``zlib``.
+    """
 
     codec: str
     encoded: bytes
@@ -38,14 +42,14 @@ class PreencodedCommand:
 
 
 def preencode(codec: Codec, payload: Any) -> PreencodedCommand:
-    """Encode *payload* for *codec*; raises BadMessage if it cannot be encoded."""
+    """Return *payload* encoded for *codec*; raises BadMessage if it cannot be encoded."""
     encoded = encode_payload(codec, payload)
     blocks = _blocks(encoded, zlib.Z_SYNC_FLUSH) if codec.name == "zlib" else b""
     return PreencodedCommand(codec=codec.name, encoded=encoded, deflated=blocks)
 
 
 def encode_payload(codec: Codec, payload: Any) -> bytes:
-    """Return *payload* as a message of *codec* contains it, not deflated; raises BadMessage."""
+    """Return the bytes of *payload* inside a message of *codec*, without compression; raises BadMessage."""
     try:
         return _encode_binary(payload) if codec.name == "bin" else _encode_json(payload)
     except (RecursionError, ValueError, TypeError, OverflowError) as error:
@@ -55,11 +59,12 @@ def encode_payload(codec: Codec, payload: Any) -> bytes:
 def encode_command(codec: Codec, command: Command) -> bytes:
     """Return the WebSocket message of *command*, whose payload may be a `PreencodedCommand`.
 
-    With zlib the envelope is deflated, the payload's blocks are appended and the checksum is recomputed: a
-    stream may hold blocks of several compressors if none refers to data before its own.
+    With the codec ``zlib``, the command without its payload is compressed, the deflate blocks of the payload
+    are appended, and the checksum of the whole is computed.  A zlib stream may consist of blocks of several
+    compressors if no block refers to data of another compressor.
 
     Raises:
-        BadMessage: It cannot be encoded, or was encoded for another codec.
+        BadMessage: The command cannot be encoded, or its payload was encoded for another codec.
 
     Source:
         RFC 1950 and 1951.
@@ -90,8 +95,9 @@ def encode_command(codec: Codec, command: Command) -> bytes:
 
 
 def _blocks(text: bytes, mode: int) -> bytes:
-    """Return *text* as deflate blocks that end as *mode* says and refer to nothing before them."""
+    """Return *text* as raw deflate blocks that refer to no data before them; *mode* is their flush mode."""
     return deflated(text, mode=mode, window_bits=-zlib.MAX_WBITS)
 
 
+# Deflate blocks of the text after the payload, which end the stream of a command.
 _CLOSING = _blocks(_AFTER, zlib.Z_FINISH)
