@@ -1,9 +1,10 @@
-"""The rules of a robot's side of the protocol, over any number of connections, without input or output.
+"""The rules of the robot's side of the protocol, over any number of connections, without input or output.
 
-A `ClientSession` lives as long as the robot, a `ConnectionState` as long as one WebSocket.  Commands survive
-the end of a connection: they are sent again on the next one, under the same id.  Every command gets exactly
-one final answer, no stale answer is delivered as fresh, and no more are unanswered than the server accepts.
-The caller passes the time as ``now``: seconds of the robot's monotonic clock.
+A `ClientSession` exists as long as the robot's program, a `ConnectionState` as long as one WebSocket.  A
+command survives the loss of its connection: it is sent again on the next connection, with the same id.  Each
+command gets exactly one final answer, an answer that came after its deadline or after that of a newer frame
+is reported as a failure, and the number of unanswered commands never exceeds the server's limit.  The caller
+passes the time as ``now``: seconds of the robot's monotonic clock.
 """
 
 from __future__ import annotations
@@ -55,22 +56,29 @@ __all__ = [
 ]
 
 _CAPABILITIES = ("move", PROGRESS, UPDATES)
+"""The capabilities that the robot announces in its Hello."""
 _MAX_TRIES_AFTER_LOSS = 2
-"""Times that a command is sent again after the answer ``worker-lost``: the command may be the cause."""
+"""Times that a command is sent again after the answer ``worker-lost``: the command itself may have caused
+the loss of the worker process."""
 _RETRY_BURST = 5.0
-"""Retries after busy that a robot may make at once, before `RETRY_SHARE` limits them."""
+"""Commands that a robot may send again after the answer ``busy`` before `RETRY_SHARE` limits them."""
 _PINGS_PER_STALL_TIMEOUT = 3.0
+"""Pings in each ``session.stall_timeout_s`` while a command is unanswered, so that the connection does not
+count as lost because of one lost ping."""
 _MAX_DEADLINE_MS = 3.6e6
+"""Longest deadline that a command states, in milliseconds: the limit of the protocol, one hour."""
 RETRY_SHARE = 0.1
-"""Retries after busy, as a share of the commands.  Source: Google SRE book, ch. 21."""
+"""Commands that may be sent again after the answer ``busy``, for each new command: at most a tenth, so that
+retries add little load to servers that are overloaded.  Source: Google SRE book, ch. 21."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered:
-    """A command ended.
+    """A command got its final answer, from the server or from the session itself (such as ``expired``).
 
-    ``sent_s`` is when the robot accepted it (its clock); ``up_s`` and ``down_s`` are the paper's two
-    one-way delays, None where no clock offset is known; ``wire_bytes`` is the size of its message.
+    ``sent_s`` is the time of the robot's clock at which `ClientSession.submit` accepted the command.
+    ``up_s`` and ``down_s`` are the one-way delays (s) of the command and of the answer, None if no clock
+    offset is known.  ``wire_bytes`` is the size of the command's message.
     """
 
     id: int
@@ -83,14 +91,14 @@ class Answered:
 
 @dataclass(frozen=True, slots=True)
 class Welcomed:
-    """The server accepted the connection; the session sends on it from now on."""
+    """The server accepted the connection; the caller may now pass it to `ClientSession.adopt`."""
 
     welcome: Welcome
 
 
 @dataclass(frozen=True, slots=True)
 class MoveRequested:
-    """The server asks the robot to connect to another server."""
+    """The server asks the robot to connect to another server within ``within_s`` seconds."""
 
     reason: str
     within_s: float
@@ -98,21 +106,21 @@ class MoveRequested:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLost:
-    """The connection is lost, although its socket may still be open."""
+    """The server did not respond in time, so the connection counts as lost; its socket may still be open."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """The server reports a failure of a message or of the session, not of one command."""
+    """The server reports a failure that concerns a message or the session, not one command."""
 
     failure: Failure
 
 
 @dataclass(frozen=True, slots=True)
 class Progressed:
-    """Progress of a long command: the share *done* (0..1), and *what* was done last."""
+    """Progress of a long command: the part that is *done* (0..1), and *what* was done last."""
 
     id: int
     done: float
@@ -121,7 +129,7 @@ class Progressed:
 
 @dataclass(frozen=True, slots=True)
 class RenewalDue:
-    """The connection expires soon unless a fresh token is sent: see `ClientSession.renew`."""
+    """The connection expires soon, with the robot's token: send a fresh one by `ClientSession.renew`."""
 
 
 Event = (
@@ -139,6 +147,8 @@ Event = (
 
 @dataclass(slots=True, kw_only=True)
 class _Pending:
+    """A command without a final answer; ``connection`` is None while it waits to be sent."""
+
     command: Command
     deadline: float
     submitted: float
@@ -155,13 +165,18 @@ class _Pending:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ConnectionState:
-    """What the robot knows of one WebSocket."""
+    """What the robot knows of one WebSocket.
+
+    ``outgoing`` are the encoded messages that the caller has to send on it.  ``leaving`` is set when another
+    connection became the current one, ``lost`` when this one was lost or closed.  Times are seconds of the
+    robot's clock.
+    """
 
     opened: float
     welcome: Welcome | None = None
     leaving: bool = False
     lost: bool = False
-    last_heard: float = 0.0
+    last_received: float = 0.0
     last_checked: float = 0.0
     last_ping: float | None = None
     ping_sent: float | None = None
@@ -174,7 +189,7 @@ class ConnectionState:
 
     @property
     def server(self) -> str:
-        """The server's name, empty before the Welcome."""
+        """The name of the server, "" before the Welcome."""
         return self.welcome.server if self.welcome else ""
 
 
@@ -182,8 +197,12 @@ class ClientSession:
     """All commands of one robot, and the connections that carry them.
 
     Attributes:
-        held_back: How many commands were not sent at once although there was a connection, each counted by
-            the first reason.
+        current: The connection on which commands are sent; None without one.
+        resent: Number of times that a command was sent again on a later connection.
+        dropped_answers: Number of answers to commands that had their final answer already, or were cancelled.
+        held_back: By reason, the number of commands that were not sent at once although there was a
+            connection; a command is counted once, by its first reason.
+        subscriptions: The robot's subscriptions.
     """
 
     def __init__(self, *, codec: Codec, settings: SessionSettings, sdk: str, first_id: int = 1) -> None:
@@ -199,13 +218,15 @@ class ClientSession:
         self._sequence: dict[str, int] = {}
         self._delivered: dict[str, int] = {}
         self._busy_streams: dict[str, tuple[float, Failure]] = {}
-        """By stream, until when it is held back, and the busy answer; a new connection clears this."""
+        """By stream: the time until which its commands wait after a busy answer, and this answer.
+
+        A new connection clears this."""
         self._retry_tokens = _RETRY_BURST
         self.subscriptions = ClientSubscriptions()
 
     @property
     def unanswered(self) -> int:
-        """How many commands have no final answer yet."""
+        """The number of commands without a final answer, without those that were cancelled."""
         return sum(not pending.cancelled for pending in self._pending.values())
 
     def submit(
@@ -220,14 +241,23 @@ class ClientSession:
         trace: str = "",
         is_open_ended: bool = False,
     ) -> int:
-        """Accept a command and return its id; it is sent when a connection has capacity for it.
+        """Accept a command and return its id; it is sent as soon as a connection has capacity for it.
 
-        A command without *deadline_s* gets ``session.answer_timeout_s``, unless it *is_open_ended* or the
-        server reports progress on it, which marks it as long.
+        Args:
+            service: Name of the service.
+            payload: The request.
+            now: Time of the robot's clock, s.
+            deadline_s: Seconds until the command ends with ``expired``.  None means
+                ``session.answer_timeout_s``, and no deadline once the server reports progress on the command.
+            stream: Stream of frames to which the command belongs, "" for none; a newer frame replaces a
+                waiting one.
+            keep: Whether a newer frame of the stream does not replace this one.
+            trace: Trace id of the command.
+            is_open_ended: Whether a command without *deadline_s* has no deadline.
 
         Raises:
-            BadMessage: The payload does not travel in messages.
-            LimitExceeded: The message would be larger than the limit.
+            BadMessage: The payload cannot be encoded.
+            LimitExceeded: The message would be larger than the limit of the robot or of the server.
         """
         default_s = math.inf if is_open_ended else self.settings.answer_timeout_s
         timeout_s = default_s if deadline_s is None else deadline_s
@@ -260,20 +290,20 @@ class ClientSession:
         return command.id
 
     def subscribe(self, topic: str, now: float) -> int:
-        """Ask for the updates of *topic*, on this connection and all later ones; return the id."""
+        """Subscribe to *topic* on the current connection and all later ones; return the subscription's id."""
         identity, self._next_id = self._next_id, self._next_id + 1
-        self._say(self.subscriptions.add(identity, topic, now), now)
+        self._send(self.subscriptions.add(identity, topic, now), now)
         return identity
 
     def unsubscribe(self, identity: int, now: float) -> None:
-        """End a subscription; does nothing if it has ended."""
-        self._say(self.subscriptions.remove(identity), now)
+        """End the subscription *identity*; do nothing if it has ended already."""
+        self._send(self.subscriptions.remove(identity), now)
 
     def cancel(self, identity: int) -> None:
-        """Forget a command that its caller gave up; its answer, if one comes, is dropped.
+        """Cancel the command *identity*; its answer is dropped, and no event reports its end.
 
-        The server is asked to cancel a long command.  If the connection ends first, the command is sent
-        again on the next one, because only there can it be cancelled.
+        The server is asked to cancel a long command.  If the connection is lost before, the command is sent
+        again on the next connection and cancelled there, because the job continues without a connection.
         """
         pending = self._pending.get(identity)
         if pending is None or pending.cancelled:
@@ -285,13 +315,13 @@ class ClientSession:
             del self._pending[identity]
 
     def open_connection(self, now: float) -> ConnectionState:
-        """Return the state of a WebSocket that was just opened, with a Hello to send."""
-        connection = ConnectionState(opened=now, last_heard=now, last_checked=now)
+        """Return the state of a WebSocket that was just opened; its ``outgoing`` holds a Hello."""
+        connection = ConnectionState(opened=now, last_received=now, last_checked=now)
         connection.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=_CAPABILITIES)))
         return connection
 
     def close_connection(self, connection: ConnectionState) -> None:
-        """Record that the WebSocket of *connection* ended; its commands wait for the next connection."""
+        """Record that *connection* was lost or closed; its unanswered commands wait for the next one."""
         connection.lost = True
         self.subscriptions.lose(connection)
         if self.current is connection:
@@ -303,16 +333,17 @@ class ClientSession:
                     del self._pending[identity]
 
     def unanswered_on(self, connection: ConnectionState) -> int:
-        """Return how many commands sent on *connection* are unanswered and not cancelled."""
+        """Return the number of commands that were sent on *connection*, are unanswered and not cancelled."""
         return sum(
             pending.connection is connection and not pending.cancelled for pending in self._pending.values()
         )
 
     def adopt(self, connection: ConnectionState, now: float) -> list[Event]:
-        """Make a welcomed *connection* the current one and send the waiting commands on it.
+        """Make *connection*, which the server has welcomed, the current one; send the waiting commands on it.
 
-        Of a latest-wins stream only the newest frame is sent again.  After a long outage frames are sent in
-        the order and at the rate that `rse_pf.wire.rate_limit` describes.
+        Of the waiting frames of a stream only the newest is sent, except those with ``keep``; the others end
+        as ``stale``.  After a long outage frames are sent in the order and at the rate that
+        `rse_pf.wire.rate_limit` describes.  Returns the events of commands that ended.
         """
         before, self.current = self.current, connection
         self._busy_streams.clear()
@@ -321,7 +352,7 @@ class ClientSession:
             for pending in self._pending.values():
                 if pending.connection is before and pending.is_long and not pending.cancelled:
                     pending.connection = None  # the job continues on any server; the old one can close now
-        self._say(self.subscriptions.adopt(connection, now), now)
+        self._send(self.subscriptions.adopt(connection, now), now)
         frames = [frame for frame in self._pending.values() if _is_frame(frame) and frame.connection is None]
         if (
             before is None
@@ -332,8 +363,8 @@ class ClientSession:
         return self._flush(now)
 
     def receive(self, connection: ConnectionState, data: bytes, now: float) -> list[Event]:
-        """Return the events of one WebSocket message; raises ProtocolError if it is invalid."""
-        connection.last_heard = now
+        """Return the events of the WebSocket message *data*; raises ProtocolError if the message is invalid."""
+        connection.last_received = now
         message = self.codec.decode_from_server(data)
         match message:
             case Welcome():
@@ -358,13 +389,16 @@ class ClientSession:
                 return self._answer(connection, message, now) + self._flush(now)
 
     def renew(self, connection: ConnectionState, token: str) -> None:
-        """Send a fresh *token* on *connection*; the server then extends the connection."""
+        """Send a fresh *token* on *connection*, so that the server keeps the connection until it expires."""
         connection.outgoing.append(self.codec.encode(Renew(token=token)))
 
     def due(self, now: float) -> list[Event]:
-        """End the commands whose deadline has passed, and send those that may be sent (again) now."""
+        """End the commands whose deadline has passed, and send the waiting commands that may be sent now.
+
+        Returns the events of all commands and subscriptions that ended.
+        """
         again, ended = self.subscriptions.due(now)
-        self._say(again, now)
+        self._send(again, now)
         events: list[Event] = [*ended]
         for identity, pending in list(self._pending.items()):
             if now >= pending.deadline:
@@ -377,7 +411,7 @@ class ClientSession:
         return events + self._flush(now)
 
     def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
-        """End everything with a failure, because no further connection will be opened."""
+        """End all subscriptions and commands with a failure, because no further connection will be opened."""
         return [*self.subscriptions.abandon(code, message, hint), *self.end_commands(code, message, hint)]
 
     def end_commands(self, code: str, message: str, hint: str = "") -> list[Event]:
@@ -388,16 +422,17 @@ class ClientSession:
         return events
 
     def check(self, connection: ConnectionState, now: float) -> list[Event]:
-        """Send a ping when one is due, and return `ConnectionLost` when the server does not respond.
+        """Send a ping when one is due; return `ConnectionLost` when the server has not responded in time.
 
-        A robot that did not run for a while cannot tell whether the server was silent in that time, so such
-        a gap does not count towards a timeout.
+        Returns `RenewalDue` when a fresh token is due.  If this method was not called for
+        ``session.stall_timeout_s``, because the robot's program was paused, the time of the pause does not
+        count as silence of the server.
         """
         s = self.settings
         if connection.lost:
             return []
         if now - connection.last_checked >= s.stall_timeout_s:
-            connection.last_heard = now
+            connection.last_received = now
             connection.ping_sent = None if connection.ping_sent is None else now
         connection.last_checked = now
         if connection.welcome is None:
@@ -410,7 +445,7 @@ class ClientSession:
             for pending in self._pending.values()
             if pending.connection is connection and pending.sent_at is not None and not pending.is_long
         ]
-        if waiting and now - max(connection.last_heard, min(waiting)) >= s.stall_timeout_s:
+        if waiting and now - max(connection.last_received, min(waiting)) >= s.stall_timeout_s:
             return self._lose(connection, "silence")
         pause = s.ping_interval_s
         if waiting:
@@ -423,7 +458,7 @@ class ClientSession:
         return [RenewalDue()] if not connection.leaving and connection.renewal.is_due(now) else []
 
     def next_due(self, now: float) -> float:
-        """Return the time at which `due` and `check` must be called again."""
+        """Return the time at which `due` and `check` must be called next, at the latest."""
         first = now + self.settings.stall_timeout_s / _PINGS_PER_STALL_TIMEOUT
         next_s = now if self.current is None else self.current.rate_limiter.next_s(now)
         for pending in self._pending.values():
@@ -438,7 +473,11 @@ class ClientSession:
         return max(now, first)
 
     def _flush(self, now: float) -> list[Event]:
-        """Send the waiting commands, oldest first, as far as the server's limits allow."""
+        """Send the waiting commands as far as the server's limits allow, and end those that are void.
+
+        They are sent oldest first, and after a long outage in the order of `send_order`.  Returns the events
+        of the commands that ended: as ``stale``, or with the busy answer of their stream.
+        """
         connection = self.current
         if connection is None:
             return []
@@ -464,16 +503,19 @@ class ClientSession:
         return events
 
     def _is_replaced(self, command: Command) -> bool:
-        """Return whether a newer frame of its stream makes this one void."""
+        """Return whether *command* is a frame without ``keep``, and its stream has a newer frame."""
         return bool(command.stream) and not command.keep and command.seq < self._sequence[command.stream]
 
     def _not_before(self, pending: _Pending) -> float:
-        """Return the time until which a busy answer holds back this command or its stream."""
+        """Return the time until which this command waits, because it or its stream was answered ``busy``."""
         until_s, _ = self._busy_streams.get(pending.command.stream, (0.0, None))
         return max(pending.not_before, until_s)
 
     def _busy_for_too_long(self, pending: _Pending, now: float) -> Failure | None:
-        """Return the answer by which a waiting frame ends whose stream is held back past its deadline."""
+        """Return the busy answer with which a command ends if its stream must wait past its deadline.
+
+        None if the command can still be sent before its deadline.
+        """
         until_s, busy = self._busy_streams.get(pending.command.stream, (0.0, None))
         if busy is None or until_s < pending.deadline or until_s <= now:
             return None
@@ -481,7 +523,7 @@ class ClientSession:
         return msgspec.structs.replace(busy, id=command.id, trace=command.trace, retry_after_ms=left_ms)
 
     def _may_send(self, pending: _Pending, connection: ConnectionState, capacity: int, now: float) -> bool:
-        """Return whether this command may be sent now; count it if it is held back."""
+        """Return whether *pending* may be sent now; if not, count it once in ``held_back``."""
         reason = self._reason_to_wait(pending, connection, capacity, now)
         if reason is not None and not pending.was_held:
             pending.was_held = True
@@ -491,6 +533,11 @@ class ClientSession:
     def _reason_to_wait(
         self, pending: _Pending, connection: ConnectionState, capacity: int, now: float
     ) -> Reason | None:
+        """Return why *pending* may not be sent now, None if it may.
+
+        *capacity* is the number of commands that the server's limits allow on *connection*; the frames of a
+        backlog are limited further.
+        """
         if now < self._not_before(pending):
             return "busy"
         if capacity > 0 and pending.command.stream and connection.backlog is not None:
@@ -501,13 +548,16 @@ class ClientSession:
         return None if capacity > 0 else "own-limit"
 
     def _capacity(self, connection: ConnectionState, now: float) -> int:
-        """Return how many commands may be sent now without exceeding the server's limits."""
+        """Return the number of commands that may be sent now within the server's limits."""
         limit = connection.welcome.limits.max_in_flight if connection.welcome else self.settings.max_in_flight
         free = max(1, limit) - sum(pending.connection is connection for pending in self._pending.values())
         return min(free, connection.rate_limiter.available(now))
 
-    def _say(self, messages: list[Message], now: float) -> None:
-        """Write *messages* on the current connection, whatever the rate limit says."""
+    def _send(self, messages: list[Message], now: float) -> None:
+        """Send *messages* on the current connection at once; they count for the rate limit but never wait.
+
+        Without a connection they are dropped.
+        """
         if self.current is not None:
             self.current.outgoing += [self.codec.encode(message) for message in messages]
             for _ in messages:
@@ -565,7 +615,11 @@ class ClientSession:
         return self._end(command.id, answer, up_s, down_s)
 
     def _retry(self, pending: _Pending, failure: Failure, now: float) -> bool:
-        """Schedule a retry if another server or a later time may help; return whether one is scheduled."""
+        """Schedule a retry of *pending* after *failure*, if its code and the limits allow one.
+
+        A command is sent again at once after ``worker-lost``, and after the server's pause after ``busy``.
+        Returns whether the command waits for its retry; if not, *failure* is its final answer.
+        """
         pause_s = max(0.0, failure.retry_after_ms or 0.0) / 1e3
         if failure.code == "busy" and pause_s > 0.0 and pending.command.stream:
             self._busy_streams[pending.command.stream] = now + min(MAX_PAUSE_S, pause_s), failure
@@ -584,7 +638,10 @@ class ClientSession:
         return True
 
     def _progress(self, connection: ConnectionState, progress: Progress) -> list[Event]:
-        """Mark a command as long, so that the default deadline no longer applies to it."""
+        """Mark the command of *progress* as long, so that the default deadline no longer applies to it.
+
+        Returns the event; none if the command has ended or was cancelled, or was sent on another connection.
+        """
         pending = self._pending.get(progress.id)
         if pending is None or pending.connection is not connection:
             return []
@@ -650,7 +707,7 @@ def _with_deadline(command: Command, remaining_s: float) -> Command:
 
 
 def _is_frame(pending: _Pending) -> bool:
-    """Return whether the command is a frame: part of a stream, with a deadline."""
+    """Return whether the command is a frame: it belongs to a stream and has a deadline."""
     return bool(pending.command.stream) and math.isfinite(pending.deadline)
 
 

@@ -1,8 +1,9 @@
-"""Read a command's id and service without its payload, and encode its refusal, both at the least cost.
+"""Read the id and the service of a command without its payload, and encode its refusal, both at little cost.
 
-A server under overload must refuse a command for much less than it costs to accept one.  A message whose
-envelope is not recognised is left to `Codec.decode_from_robot`; one that is recognised may still be invalid.
-Of a message that the codec refused only the id is read, from a bounded number of its first bytes.
+A server under overload must refuse a command in much less time than it takes to answer one.  `peek` reads id
+and service of most commands; a message that it does not recognise is left to `Codec.decode_from_robot`, and
+one that it recognises may still be invalid.  `undecodable_id` reads the id of a message that the codec
+refused, from a bounded number of its first bytes.
 """
 
 from __future__ import annotations
@@ -22,32 +23,36 @@ from rse_pf.wire.messages import Failure
 
 __all__ = ["Envelope", "encode_refusal", "peek", "undecodable_id"]
 
+# First bytes of a message that are read, at most; id and service are in the first 160.
 _MAX_PEEKED_BYTES = 512
+# Bytes to which `peek` inflates the start of a message: enough for the longest id and service.
 _INFLATED_BYTES = 160
 
 # The start of a command as the SDK writes it: type, id, and a service of at most 64 characters.  Some
-# encoders put a space behind each mark.
+# encoders put a space after each colon and comma.
 _HEAD = re.compile(
     rb'\{"type": ?"command", ?"id": ?(0|[1-9][0-9]{0,15}), ?"service": ?'
     rb'"([\x20-\x21\x23-\x5b\x5d-\x7e]{1,64})"[,}]'
 )
 
-# One member of a JSON object whose value is no list and no object, and the mark behind it.
+# One member of a JSON object whose value is neither a list nor an object; a comma or } follows it.
 _MEMBER = re.compile(
     rb'\s*[{,]\s*"((?:[^"\\]|\\.)*)"\s*:\s*("(?:[^"\\]|\\.)*"|-?[0-9][0-9.eE+-]*|true|false|null)\s*(?=[,}])'
 )
+# Compressed bytes of a damaged message that are inflated at once, so that the text before the damage is read.
 _INFLATED_PIECE_BYTES = 64
+# Fields of a message that are searched for its type and id.
 _MAX_FIELDS = 16
 _MAP_HEAD_BYTES = {0xDE: 3, 0xDF: 5}
-"""Of the maps that are not short."""
+"""By first byte of a MessagePack map with more than 15 members: bytes before its first member."""
 _WITH_ANSWER = ("command", "subscribe")
-"""The types whose id an answer names."""
+"""Types of the robot's messages whose ``id`` an answer repeats."""
 _SCALAR = Budget(
     wire_bytes=_MAX_PEEKED_BYTES, inflated_bytes=_MAX_PEEKED_BYTES, inflate_ratio=1.0,
     free_bytes=_MAX_PEEKED_BYTES, depth=1, containers=0, values=4, mixed_values=4,
     memory_bytes=_MAX_PEEKED_BYTES,
 )  # fmt: skip
-"""What one field before the id may be: no list and no map."""
+"""Limits of the value of one field before the id: a number or a short text, no list and no map."""
 
 
 class _Command(msgspec.Struct, frozen=True, kw_only=True, tag="command", tag_field="type"):
@@ -60,16 +65,19 @@ _encode_json = msgspec.json.Encoder().encode
 
 
 class Envelope(NamedTuple):
-    """The fields of a command that its refusal names."""
+    """The id and the service of a command, which its refusal repeats."""
 
     id: int
     service: str
 
 
 def peek(codec: Codec, data: bytes) -> Envelope | None:
-    """Return id and service of the command in *data*, None if they are not at its start."""
+    """Return the id and the service of the command in *data*, without a check of the rest.
+
+    None if *data* does not begin with them in the form that the SDK writes.
+    """
     own: Callable[[bytes], Envelope | None] | None = getattr(codec, "peek", None)
-    if own is not None:  # its messages do not begin like a command
+    if own is not None:  # the messages of this codec have a form that only the codec itself can read
         return own(data)
     if codec.name == "bin":
         try:
@@ -91,10 +99,10 @@ def peek(codec: Codec, data: bytes) -> Envelope | None:
 
 
 def undecodable_id(codec: Codec, data: bytes) -> int | None:
-    """Return the id of the command or subscription in *data*, which *codec* refused; None if it has none.
+    """Return the id of the command or subscription in *data*, a message that *codec* refused to decode.
 
-    The id is read only from the first bytes, and only if `type` and `id` stand before every list and object.
-    Any other message has no id here: what a ``cancel`` or ``unsubscribe`` names is not ended by its refusal.
+    None if the first bytes hold no id, if a list or an object comes before ``type`` and ``id``, or if the
+    message has another type: the refusal of a ``cancel`` must not end the command whose id it repeats.
     """
     is_binary = codec.name == "bin"
     decode: Callable[[bytes], Any] = msgspec.msgpack.decode if is_binary else msgspec.json.decode
@@ -115,24 +123,27 @@ def undecodable_id(codec: Codec, data: bytes) -> int | None:
 
 
 def _text_head(codec: Codec, data: bytes) -> bytes:
-    """Return the first characters of a JSON message; of a damaged zlib stream those before the damage."""
+    """Return the first `_MAX_PEEKED_BYTES` of a JSON message, inflated for ``zlib``.
+
+    Of a damaged zlib stream, the text before the damage is returned.
+    """
     head = data[:_MAX_PEEKED_BYTES]
     if codec.name != "zlib":
         return head
     stream, text = zlib.decompressobj(), b""
     for at in range(0, len(head), _INFLATED_PIECE_BYTES):
-        room_bytes = _MAX_PEEKED_BYTES - len(text)
-        if room_bytes <= 0:
+        left_bytes = _MAX_PEEKED_BYTES - len(text)
+        if left_bytes <= 0:
             break
         try:
-            text += stream.decompress(head[at : at + _INFLATED_PIECE_BYTES], room_bytes)
+            text += stream.decompress(head[at : at + _INFLATED_PIECE_BYTES], left_bytes)
         except zlib.error:
             break
     return text
 
 
 def _json_fields(head: bytes) -> Iterator[tuple[str, bytes]]:
-    """Yield name and text of the members at the start of an object, up to the first list or object."""
+    """Yield name and value, as JSON, of the first members of an object, up to the first list or object."""
     at = 0
     while member := _MEMBER.match(head, at):
         at = member.end()
@@ -140,7 +151,13 @@ def _json_fields(head: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _binary_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of the fields at the start of a map; raises ProtocolError at anything else."""
+    """Yield name and value (MessagePack) of the fields at the start of a map.
+
+    Nothing is yielded if *data* does not begin with a map.
+
+    Raises:
+        ProtocolError: A value is a list, a map or too long, or *data* end.
+    """
     head = data[:_MAX_PEEKED_BYTES]
     if not head or not (0x80 <= head[0] < 0x90 or head[0] in _MAP_HEAD_BYTES):
         return
@@ -153,7 +170,10 @@ def _binary_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def encode_refusal(codec: Codec, failure: Failure) -> bytes:
-    """Return the message of *failure*; with zlib it is stored, not deflated: 180 bytes instead of 150."""
+    """Return *failure* as a WebSocket message of *codec*; with ``zlib`` it is not compressed, to save time.
+
+    Such a message has 180 bytes instead of 150.
+    """
     if codec.name != "zlib":
         return codec.encode(failure)
     return stored(_encode_json(failure))

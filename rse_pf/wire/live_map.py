@@ -1,8 +1,8 @@
-"""Messages between robots and live maps: requests of the services ``live-*``, replies and updates.
+"""Messages between robots and live maps: requests and replies of the services ``live-*``, and updates.
 
-``docs/protocol.md`` describes the same messages.  Poses are ``(4, 4)``, row-major, flat; a covariance holds
-the 21 numbers of the upper triangle, row after row, of the ``(6, 6)`` covariance of the twist (metres, then
-radians) on the left of its pose.
+``docs/protocol.md`` describes the same messages.  A pose is a ``(4, 4)`` matrix as 16 numbers in row-major
+order.  A covariance holds the 21 numbers of the upper triangle, row after row, of the ``(6, 6)`` covariance
+of a twist (metres, then radians) that is applied to the pose from the left.
 """
 
 from __future__ import annotations
@@ -44,33 +44,42 @@ __all__ = [
 ]
 
 LIVE_TOPIC = "live/"
-"""Beginning of the topics of live maps; the name of the map follows."""
+"""Beginning of the topic of a live map; the name of the map follows."""
 
+# The name of a map: at most 64 lower-case letters, digits and hyphens, not a hyphen first.
 _MapName = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}\Z")]
+# A text that names a version of a map: "" or "head" for the newest, or the first 6 to 64 digits of its id.
 _VERSION = re.compile(r"|head|[0-9a-f]{6,64}")
+# A number from 0 that each language's number type can hold.
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
 
 
 class _Value(msgspec.Struct, frozen=True, kw_only=True):
-    """Unknown fields are ignored."""
+    """The base of all requests, replies and updates; a receiver ignores fields that it does not know."""
 
 
 class LiveMapRequest(_Value, frozen=True, kw_only=True):
-    """``live-leave``, ``live-publish`` and ``live-stop``: the name of a map of the tenant."""
+    """Request of ``live-leave``, ``live-publish`` and ``live-stop``: the name of a live map of the tenant.
+
+    The robot leaves the map, or an operator publishes a version of it, or ends it.
+    """
 
     map: _MapName
 
 
 class LiveShow(LiveMapRequest, frozen=True, kw_only=True):
-    """``live-show``; with ``paths``, where the keyframes of all robots lie in the map, too."""
+    """Request of ``live-show``: the state of a live map.
+
+    With ``paths`` the reply also holds the positions of the keyframes of all robots in the map.
+    """
 
     paths: bool = False
 
 
 class KeyframeRequest(_Value, frozen=True, kw_only=True):
-    """``live-keyframe``: one keyframe of the robot that sends it.
+    """Request of ``live-keyframe``: add one keyframe of the robot that sends it to the live map.
 
-    ``segment`` counts the robot's odometry frames, ``number`` its keyframes over all segments, both from 0.
+    ``segment`` numbers the robot's odometry frames, ``number`` its keyframes over all segments, both from 0.
     ``keyframe`` is encoded by `rse_pf.slam.keyframe`.
     """
 
@@ -81,23 +90,30 @@ class KeyframeRequest(_Value, frozen=True, kw_only=True):
 
 
 class KeyframeKept(_Value, frozen=True, kw_only=True):
-    """The keyframe is durable: the ``number`` that comes next, and the position in the map's log."""
+    """Reply of ``live-keyframe``: the keyframe is stored durably.
+
+    ``number`` is the number of the robot's next keyframe, ``version`` the position in the map's log.
+    """
 
     number: int
     version: int
 
 
 class LiveRelocalise(_Value, frozen=True, kw_only=True):
-    """``live-relocalise``: find the pose of this keyframe in the map, without regard to the pose in it."""
+    """Request of ``live-relocalise``: find the pose of ``keyframe`` in the map, by its image features alone.
+
+    The pose that the keyframe states does not count, and the keyframe is not added to the map.
+    """
 
     map: _MapName
     keyframe: bytes
 
 
 class RelocaliseReply(_Value, frozen=True, kw_only=True):
-    """The pose with its verdict, and why it is not ``ok``; ``none`` comes without a pose.
+    """Reply of ``live-relocalise``: the pose, whether it can be trusted (``verdict``), and why it cannot.
 
-    ``scale`` is how many metres the unit of the keyframe is, none if it is a metre.
+    With the verdict ``none`` there is no pose.  ``scale`` is the length in metres of the keyframe's unit of
+    length; it is absent if this unit is the metre.
     """
 
     verdict: Literal["ok", "weak", "none"]
@@ -111,16 +127,18 @@ class RelocaliseReply(_Value, frozen=True, kw_only=True):
 
 
 class LiveForget(_Value, frozen=True, kw_only=True):
-    """``live-forget``: take out of the map what one robot contributed."""
+    """Request of ``live-forget``: remove from the map everything that ``robot`` has contributed to it."""
 
     map: _MapName
     robot: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 
 
 class LiveStart(_Value, frozen=True, kw_only=True):
-    """``live-start``: begin the map, empty or with a version of the registry, NAME or NAME@VERSION.
+    """Request of ``live-start``: begin the live map, empty or with a stored version of a map.
 
-    ``equal_rooms_m`` is the size of rooms that look the same, 0 if every place is unique.
+    ``from`` names the stored version: NAME, NAME@VERSION or VERSION; it is empty for an empty map.
+    ``equal_rooms_m`` is the size in metres of rooms that look the same to a camera, 0 if every place is
+    unique.
     """
 
     map: _MapName
@@ -128,7 +146,10 @@ class LiveStart(_Value, frozen=True, kw_only=True):
     equal_rooms_m: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)] = 0.0
 
     def source_version(self) -> tuple[str, str]:
-        """Return the map and the version that ``source`` names; a version alone is one of this map."""
+        """Return the name of the map and the version that ``source`` names.
+
+        A version without a name is one of this map; a name without a version means ``head``, the newest one.
+        """
         name, at, version = self.source.partition("@")
         if at:
             return name, version
@@ -136,9 +157,16 @@ class LiveStart(_Value, frozen=True, kw_only=True):
 
 
 LiveRequest = KeyframeRequest | LiveRelocalise | LiveMapRequest | LiveForget | LiveStart
-"""What the owner of a map is asked for."""
-KEYFRAME, RELOCALISE, LEAVE, SHOW = "live-keyframe", "live-relocalise", "live-leave", "live-show"
-PUBLISH, STOP, FORGET, START = "live-publish", "live-stop", "live-forget", "live-start"
+"""A request that the map server of a live map answers."""
+# Names of the services of live maps.
+KEYFRAME = "live-keyframe"
+RELOCALISE = "live-relocalise"
+LEAVE = "live-leave"
+SHOW = "live-show"
+PUBLISH = "live-publish"
+STOP = "live-stop"
+FORGET = "live-forget"
+START = "live-start"
 LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
     KEYFRAME: KeyframeRequest,
     RELOCALISE: LiveRelocalise,
@@ -149,21 +177,22 @@ LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
     FORGET: LiveForget,
     START: LiveStart,
 }
-"""The request of each service that the owner of a map answers."""
+"""By name of a service that the map server of a live map answers: the type of its request."""
 
 
 class MapCause(_Value, frozen=True, kw_only=True):
-    """The keyframe that caused a correction."""
+    """The robot and the number of the keyframe that caused a correction of an alignment."""
 
     robot: str
     number: int
 
 
 class AlignmentUpdate(_Value, frozen=True, kw_only=True):
-    """Payload of the key ``alignment/ROBOT``: where a robot's odometry frame lies in the map.
+    """Payload of the key ``alignment/ROBOT``: the pose of a robot's odometry frame in the map.
 
-    ``scale`` is how many metres the unit of the segment is, by which its lengths are multiplied before
-    ``T_map_odom``; none if it is a metre.
+    ``reason`` says why the segment is not ``aligned``.  ``scale`` is the length in metres of the segment's
+    unit of length: multiply the lengths of the segment by it before you apply ``T_map_odom``.  It is absent
+    if this unit is the metre.
     """
 
     robot: str
@@ -178,7 +207,7 @@ class AlignmentUpdate(_Value, frozen=True, kw_only=True):
 
 
 class PoseUpdate(_Value, frozen=True, kw_only=True):
-    """Payload of the key ``pose/ROBOT``: where a robot's newest keyframe was made."""
+    """Payload of the key ``pose/ROBOT``: the pose of a robot's newest keyframe in the map."""
 
     robot: str
     segment: int
@@ -187,7 +216,10 @@ class PoseUpdate(_Value, frozen=True, kw_only=True):
 
 
 class MapUpdate(_Value, frozen=True, kw_only=True):
-    """Payload of the key ``map``: its size, and who serves it."""
+    """Payload of the key ``map``: the size and the state of the live map.
+
+    ``owner`` is the name of the backend server that runs the map server of this map.
+    """
 
     keyframes: int
     version: int
@@ -196,12 +228,16 @@ class MapUpdate(_Value, frozen=True, kw_only=True):
 
 
 def live_topic(map_name: str) -> str:
-    """Return the topic of the updates of a live map."""
+    """Return the topic of the updates of the live map *map_name*."""
     return LIVE_TOPIC + map_name
 
 
 def map_of_topic(topic: str) -> str:
-    """Return the name of the live map that *topic* is about; raises BadRequest."""
+    """Return the name of the live map that *topic* is about.
+
+    Raises:
+        BadRequest: *topic* is not the topic of a live map, or the name of the map is malformed.
+    """
     name = topic.removeprefix(LIVE_TOPIC)
     try:
         if name == topic:

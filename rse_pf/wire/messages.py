@@ -32,28 +32,31 @@ __all__ = [
     "Welcome",
 ]
 
+# Version of the protocol that a Hello and a Welcome state.
 PROTOCOL_VERSION = 1
 
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 """A name of at most 64 characters."""
 
 Topic = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
-"""What updates are about, such as ``live/MAP``."""
+"""The topic of a subscription, such as ``live/MAP``; at most 128 characters."""
 
 Identifier = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
-"""A counter that every language's number type can hold."""
+"""A whole number from 0 that every language's number type can hold exactly."""
 
+# A duration from 0 to one hour, in milliseconds.
 Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=3.6e6)]
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", omit_defaults=True):
-    """Unknown fields are ignored, so that a newer side may send more of them."""
+    """The base of all messages; a receiver ignores unknown fields, so that a newer sender may add some."""
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What the server accepts from this robot; a rate of 0 is none.
+    """The limits that the server applies to this robot.
 
-    ``burst_commands_per_day`` bounds what it may send to `Welcome.burst_url`.
+    ``max_commands_per_s`` limits all messages of the robot, after ``command_burst`` messages at once; 0 means
+    no limit.  ``burst_commands_per_day`` limits the commands that it may send to `Welcome.burst_url`.
     """
 
     max_message_bytes: int
@@ -64,7 +67,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Hello(_Message, frozen=True, kw_only=True, tag="hello"):
-    """Robot, first message of a socket."""
+    """Robot begins the session: the first message on a socket."""
 
     protocol: int = PROTOCOL_VERSION
     sdk: Word = ""
@@ -75,8 +78,9 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
     """Server answers a Hello with its name and its limits.
 
     ``token_s``: seconds until the server closes the socket, unless a fresh token arrives before.
-    ``burst_url``: address that answers commands by HTTP while no server can, or a path at the address of the
-    servers.  ``tenant`` and ``scopes`` are those of the robot's token; an empty ``scopes`` allows everything.
+    ``burst_url``: address to which the robot may send commands by HTTP while no server answers in time, or a
+    path at the address of the servers.  ``tenant`` and ``scopes`` are those of the robot's token; an empty
+    ``scopes`` allows everything.
     """
 
     server: str
@@ -94,8 +98,8 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
 class Command(_Message, frozen=True, kw_only=True, tag="command"):
     """Robot calls a service.  The service determines the type of ``payload``.
 
-    ``deadline_ms`` counts from the arrival at the server.  A command with a newer ``seq`` replaces a waiting
-    one of the same ``stream``, unless ``keep`` is set.
+    ``deadline_ms`` counts from the arrival at the server.  A command with a higher ``seq`` replaces a waiting
+    command of the same ``stream``, unless the waiting one has ``keep`` set.
     """
 
     id: Identifier
@@ -109,13 +113,13 @@ class Command(_Message, frozen=True, kw_only=True, tag="command"):
 
 
 class Cancel(_Message, frozen=True, kw_only=True, tag="cancel"):
-    """Robot cancels a command that reported progress; the answer may arrive nevertheless."""
+    """Robot cancels the command ``id``, which reported progress; its answer may arrive nevertheless."""
 
     id: Identifier
 
 
 class Progress(_Message, frozen=True, kw_only=True, tag="progress"):
-    """Server reports the progress of a long command: the share *done* (0..1), and *what* was done last.
+    """Server reports the progress of a long command: the part *done* (0..1), and *what* was done last.
 
     It is sent to robots whose Hello names the capability ``progress``; the first one confirms the command.
     """
@@ -155,20 +159,23 @@ class Failure(_Message, frozen=True, kw_only=True, tag="failure"):
 
 
 class Move(_Message, frozen=True, kw_only=True, tag="move"):
-    """Server asks the robot to open another socket first and then to leave this one."""
+    """Server asks the robot to open another socket within ``within_ms``, and then to close this one."""
 
     reason: str
     within_ms: float
 
 
 class Ping(_Message, frozen=True, kw_only=True, tag="ping"):
-    """Robot sends the time of its clock, ``sent_s``, the first of four time stamps."""
+    """Robot sends ``sent_s``, the time of its own clock in seconds; the server answers with a Pong."""
 
     sent_s: float
 
 
 class Pong(_Message, frozen=True, kw_only=True, tag="pong"):
-    """Server returns the robot's time stamp with two of its own clock; the robot adds the fourth."""
+    """Server answers a Ping: with the robot's ``sent_s``, and two times of the server's clock in seconds.
+
+    ``received_s`` is the time at which the Ping arrived, ``answered_s`` that at which this message was sent.
+    """
 
     sent_s: float
     received_s: float
@@ -182,7 +189,7 @@ class Renew(_Message, frozen=True, kw_only=True, tag="renew"):
 
 
 class Renewed(_Message, frozen=True, kw_only=True, tag="renewed"):
-    """Server accepted the fresh token, which expires ``token_s`` seconds after this message."""
+    """Server accepted the fresh token of a Renew, which expires ``token_s`` seconds after this message."""
 
     token_s: float
 
@@ -190,8 +197,8 @@ class Renewed(_Message, frozen=True, kw_only=True, tag="renewed"):
 class Subscribe(_Message, frozen=True, kw_only=True, tag="subscribe"):
     """Robot subscribes to a topic, and first receives its present state.
 
-    Only robots whose Hello names the capability ``updates`` may subscribe.  No command of the robot has this
-    ``id``; a refusal is a Failure with it.
+    Only robots whose Hello names the capability ``updates`` may subscribe.  ``id`` differs from the ids of
+    the robot's commands; a refusal is a Failure with this ``id``.
     """
 
     id: Identifier
@@ -199,7 +206,7 @@ class Subscribe(_Message, frozen=True, kw_only=True, tag="subscribe"):
 
 
 class Unsubscribe(_Message, frozen=True, kw_only=True, tag="unsubscribe"):
-    """Robot ends a subscription; an update that was sent before may still arrive."""
+    """Robot ends the subscription ``id``; an update that was sent before may still arrive."""
 
     id: Identifier
 

@@ -3,12 +3,12 @@
 A robot that keeps to its own rate limiter, a token bucket a little smaller than the one that the server
 applies, is not refused for its rate.
 
-When a network recovers, every robot has seconds of frames to send, and the server receives all of them at
-once.  Sent oldest first, each frame would reach the front of the queue only when its deadline has passed, and
-fresh frames would queue behind it.  After a long outage (`is_long_outage`) frames are therefore sent newest
-first and one at a time; each answer from a server whose queue is short allows one more frame in flight.
-After a short outage, such as the death of a server, every frame can still meet its deadline and the original
-order is kept.  Commands without a stream are no frames: they are sent in their original order.
+When a network recovers, every robot has the frames of some seconds to send, and the server receives all of
+them at once.  If the oldest were sent first, each frame would reach the front of the server's queue only
+after its deadline, and fresh frames would wait behind it.  After a long outage (`is_long_outage`) frames are
+therefore sent newest first and one at a time; each answer from a server whose queue is short allows one more
+frame in flight.  After a short outage, such as the loss of a server, every frame can still meet its deadline,
+and frames are sent oldest first.  Commands without a stream are no frames; they are always sent oldest first.
 
 Source:
     Maurer 2015, "Fail at Scale", ACM Queue 13(8): adaptive LIFO; Jacobson 1988: slow start.
@@ -37,23 +37,28 @@ Reason = Literal["busy", "own-limit"]
 """Why a command was held back: by a busy answer, or by the limits of the Welcome."""
 
 REASONS: tuple[Reason, ...] = get_args(Reason)
+"""All values of `Reason`."""
 
 MAX_PAUSE_S = 60.0
-"""Longest pause of a stream after one busy answer."""
+"""Longest time in seconds for which the commands of a stream wait after one busy answer, whatever pause the
+server asks for."""
 
-# Share of the server's limit that a robot uses: a network may deliver messages closer together than sent.
+# Fraction of the server's rate limit that a robot uses: a network may deliver messages closer together than
+# they were sent.
 _OWN_SHARE = 0.9
+# Messages that may be sent at once where there is no limit.
 _UNLIMITED = 1 << 30
-# The burst is what a robot sends in this time at its rate: the frames of one reconnect.
+# A robot may send as many messages at once as its rate limit allows in this time, in seconds: the frames that
+# wait during one reconnection.
 _BURST_S = 2.0
-# A server is loaded if a command waited in its queue for longer than this, in ms.
+# Time in a server's queue, in milliseconds, up to which the queue counts as short.
 _SHORT_QUEUE_MS = 50.0
-# An outage is long if it took more than this share of a frame's time.
+# Fraction of the time from a frame's submission to its deadline; an outage that took more is long.
 _LONG_OUTAGE_SHARE = 0.5
 
 
 def command_burst(max_commands_per_s: float) -> int:
-    """Return how many messages a robot of this rate may send at once; 0 where there is no rate."""
+    """Return how many messages a robot with this rate limit may send at once; 0 without a rate limit."""
     return max(1, round(_BURST_S * max_commands_per_s)) if max_commands_per_s > 0 else 0
 
 
@@ -69,39 +74,46 @@ class RateLimiter:
             self._bucket = TokenBucket(_OWN_SHARE * limits.max_commands_per_s, burst)
 
     def available(self, now: float) -> int:
-        """Return how many messages may be sent at *now* (s)."""
+        """Return how many messages may be sent at *now* (monotonic seconds)."""
         if self._bucket is None:
             return _UNLIMITED
         self._bucket.fill(now)
         return max(0, int(self._bucket.tokens))
 
     def spend(self, now: float) -> None:
-        """Count one message that is sent whatever the limit says."""
+        """Count one message that is sent at *now*, even if the limit would not allow it."""
         if self._bucket is not None:
             self._bucket.spend(1.0, now)
 
     def next_s(self, now: float) -> float:
-        """Return the time at which the next command may be sent, *now* if at once."""
+        """Return the time at which the next message may be sent; it is *now* if one may be sent at once."""
         return now if self._bucket is None else now + self._bucket.wait_s(now)
 
 
 @dataclass(slots=True, kw_only=True)
 class Backlog:
-    """How many frames may be in flight on a connection that was opened after a long outage.
+    """The number of frames that may be in flight on a connection that was opened after a long outage.
 
-    ``newest`` is the id of the last frame that waited for the connection.
+    ``newest`` is the id of the newest frame that waited for this connection: the limit holds until all frames
+    up to it were sent or have ended.
     """
 
     newest: int
     max_in_flight: int = 1
 
     def note_answer(self, queue_ms: float) -> None:
-        """Allow one more frame in flight if the server's queue is short; otherwise restart with one."""
+        """Allow one more frame in flight if *queue_ms* shows a short queue; otherwise allow only one again.
+
+        *queue_ms* is the time for which the command of an answer waited in the server's queue.
+        """
         self.max_in_flight = self.max_in_flight + 1 if queue_ms <= _SHORT_QUEUE_MS else 1
 
 
 def is_long_outage(submitted_s: float, deadline_s: float, now_s: float) -> bool:
-    """Return whether an outage that ends now took most of the time that a frame had."""
+    """Return whether an outage that ends at *now_s* took most of the time of the oldest waiting frame.
+
+    This frame was submitted at *submitted_s* and has the deadline *deadline_s*.
+    """
     return now_s - submitted_s > _LONG_OUTAGE_SHARE * (deadline_s - submitted_s)
 
 

@@ -1,7 +1,7 @@
-"""The HTTP reply of a server that refuses a handshake, and the member by which a robot recognises it.
+"""The body of the HTTP reply of a server that refuses a WebSocket handshake, as a robot reads it.
 
-Firewalls, load balancers and login pages answer with 401 and 403, too.  Without this member a robot would
-take their replies for refusals of its token.
+Firewalls, load balancers and login pages answer with 401 and 403, too.  A robot recognises the reply of our
+servers by the member ``platform``, so that it does not take another reply for a refusal of its token.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ __all__ = ["CUT_OFF", "PLATFORM", "RefusedHandshake", "refusal_body", "refusal_i
 PLATFORM = "rse-pf"
 """Value of the member ``platform`` in the body of each refusal."""
 CUT_OFF = "cut-off"
-"""The cause of a token that was issued before the time from which those of its robot are accepted."""
-_MAX_BODY_BYTES = 4096  # a longer body is none of ours
-_MAX_TEXT_CHARACTERS = 300  # of the message and the hint, which are shown to a user
-_MAX_UNIX_S = 1e11  # beyond the year 5000: no time of a cut-off
+"""Value of the member ``cause`` if the token was issued before the cut-off that an operator set: the time
+from which tokens of its robot are accepted."""
+_MAX_BODY_BYTES = 4096  # a longer body is not that of one of our servers
+_MAX_TEXT_CHARACTERS = 300  # most characters of a message or a hint that are shown to a user
+_MAX_UNIX_S = 1e11  # Unix times from here on, after the year 5000, are ignored
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefusedHandshake:
-    """The reason of a server.
+    """Why a server refused a handshake.
 
     ``cause`` is empty unless the token was signed with the key of an enrolled robot.  ``valid_from_s`` is the
-    time from which tokens are accepted after a cut-off, in Unix seconds of the server.
+    cut-off from which tokens of the robot are accepted, in Unix seconds of the server; None without one.
     """
 
     message: str
@@ -36,13 +37,19 @@ class RefusedHandshake:
 
 
 def refusal_body(code: str, message: str, hint: str, **members: Any) -> bytes:
-    """Return the JSON body of a refusal; *members* are further members, for a robot that proved its key."""
+    """Return the JSON body of a refusal.
+
+    *members*, such as ``cause``, are added for a robot whose token was signed with an enrolled key.
+    """
     body = {"platform": PLATFORM, "code": code, "message": message, "hint": hint, **members}
     return json.dumps(body, separators=(",", ":")).encode()
 
 
 def refusal_in(body: bytes, code: str) -> RefusedHandshake | None:
-    """Return the refusal in *body* if it has this *code* and is of one of our servers, else None."""
+    """Return the refusal in the *body* of an HTTP reply, if one of our servers sent it with this *code*.
+
+    None for any other body.  Texts that are not printable, and implausible times, are left out.
+    """
     if len(body) > _MAX_BODY_BYTES:
         return None
     try:

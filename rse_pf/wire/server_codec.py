@@ -1,4 +1,7 @@
-"""The codecs of servers and of the Lambda: those of robots, with isal in place of zlib for short messages."""
+"""The codecs of servers and of the Lambda function, which inflate short messages with isal, not with zlib.
+
+isal, a faster implementation of zlib, is not installed on robots.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,13 @@ __all__ = ["make_server_codec"]
 def make_server_codec(
     name: str, limits: SessionSettings | None = None, *, read_first: ReadFirst | None = None
 ) -> Codec:
-    """Return the codec called *name* of a server.
+    """Return the codec *name* as servers use it.
 
     Args:
         name: ``zlib``, ``json`` or ``bin``.
-        limits: What is accepted from robots.
-        read_first: Reads the inflated messages of one service at less cost; None for what it does not read.
+        limits: Limits of robots' messages; None means the defaults.
+        read_first: Reads the commands of one service at less cost than the codec, see `ReadFirst`; None if
+            there is no such function.
 
     Raises:
         UnsupportedProtocol: There is no such codec.

@@ -1,7 +1,7 @@
-"""The rules of a server's side of one connection, without input or output.
+"""The rules of the server's side of the protocol for one connection, without input or output.
 
-Messages and the time go in, decisions come out (`Send`, `Submit`, `Close` ...).  The robot's side is in
-`rse_pf.wire.client_session`.
+A `ServerSession` takes received messages and the time, and returns decisions (`Send`, `Submit`, `Close` ...)
+that the caller executes.  The robot's side is in `rse_pf.wire.client_session`.
 """
 
 from __future__ import annotations
@@ -66,76 +66,80 @@ __all__ = [
 ]
 
 PROGRESS = "progress"
-"""Capability of a robot that accepts progress messages and may cancel commands."""
+"""Capability in the Hello of a robot that accepts progress messages and may cancel commands."""
 
 UPDATES = "updates"
-"""Capability of a robot that may subscribe to topics."""
+"""Capability in the Hello of a robot that may subscribe to topics."""
 
 MAX_SUBSCRIPTIONS = 8
-"""Subscriptions of one connection; a robot needs one for each map that it drives in."""
+"""Most subscriptions of one connection; a robot needs one for each live map in which it drives."""
 
 RENEWAL_PAUSE_S = 1.0
-"""Minimum pause between two renewals, because each one costs a signature check."""
+"""Shortest pause in seconds between two renewals of a token on one connection, because each renewal costs the
+server a signature check."""
 
-CLOSE_GOING_AWAY = 1001
-CLOSE_PROTOCOL = 4400
-CLOSE_TOKEN_OVER = 4401
-CLOSE_REVOKED = 4403
-CLOSE_UNSUPPORTED = 4406
-CLOSE_REPLACED = 4409
-CLOSE_RATE = 4429
+# Close codes of WebSockets that a server sends.
+CLOSE_GOING_AWAY = 1001  # the robot has to leave this server, or was silent for too long
+CLOSE_PROTOCOL = 4400  # the robot broke the protocol
+CLOSE_TOKEN_OVER = 4401  # the robot's token has expired
+CLOSE_REVOKED = 4403  # the robot or its token was revoked
+CLOSE_UNSUPPORTED = 4406  # the server does not know the robot's version of the protocol
+CLOSE_REPLACED = 4409  # the robot has a newer connection
+CLOSE_RATE = 4429  # the robot continued to exceed its rate limit, or its commands crashed processes
 MAX_BAD_MESSAGES = 10
-"""Undecodable messages without a readable id after which robot and server close the socket."""
+"""Most undecodable messages without a readable id on one connection; after one more, the side that received
+them, robot or server, closes the socket."""
 _BAD_MESSAGE_BYTES = 65_536
-"""An undecodable message counts once, and once more for each of these bytes: longer ones cost more."""
+"""An undecodable message counts once, and once more for each time that its size reaches this many bytes:
+decoding a long message takes more time."""
 
 
 class Send(msgspec.Struct, frozen=True, gc=False):
-    """Write this WebSocket message."""
+    """Decision: send *data* as a WebSocket message."""
 
     data: bytes
 
 
 class SendRefusal(Send, frozen=True, gc=False):
-    """Write this WebSocket message, which refuses a message that cannot be decoded."""
+    """Decision: send *data*, which is *failure* encoded and refuses a message that cannot be decoded."""
 
     failure: Failure
 
 
 class Submit(msgspec.Struct, frozen=True, gc=False):
-    """Hand this command to the scheduler."""
+    """Decision: pass *command* to the scheduler."""
 
     command: Command
 
 
 class Close(msgspec.Struct, frozen=True, gc=False):
-    """Close the socket with this code."""
+    """Decision: close the socket with the WebSocket close code *code* and *reason*."""
 
     code: int
     reason: str
 
 
 class Withdraw(msgspec.Struct, frozen=True, gc=False):
-    """The robot cancels this command."""
+    """Decision: cancel the command *id*, because the robot asks for it."""
 
     id: int
 
 
 class Renewal(msgspec.Struct, frozen=True, gc=False):
-    """Verify this fresh token and answer with `ServerSession.answer_renewal`."""
+    """Decision: verify the fresh *token*, and send the answer that `ServerSession.answer_renewal` returns."""
 
     token: str
 
 
 class BeginUpdates(msgspec.Struct, frozen=True, gc=False):
-    """Send the updates of this topic, or refuse with `ServerSession.refuse_updates`."""
+    """Decision: send updates of *topic* as subscription *id*, or refuse by `ServerSession.refuse_updates`."""
 
     id: int
     topic: str
 
 
 class EndUpdates(msgspec.Struct, frozen=True, gc=False):
-    """Send no more updates of this subscription."""
+    """Decision: send no more updates of the subscription *id*."""
 
     id: int
 
@@ -147,16 +151,22 @@ class ServerSession:
     """One robot's connection, as its server sees it.
 
     Attributes:
-        ends_s: When the robot's token expires, on the server's clock; set after authentication.
+        robot: Name of the robot.
+        state: ``opening`` until the Hello, then ``open``, ``closed`` after a `Close`.
+        in_flight: Number of commands that were submitted and are not answered; the caller counts it down.
+        ends_s: Time of the server's clock at which the robot's token expires, which the caller sets after
+            authentication; None if it never does.
         hears_progress: Whether the robot announced the capability `PROGRESS`.
-        hears_updates: Whether it announced the capability `UPDATES`.
-        topics: The topic of each live subscription, by its id.
-        bad_messages: How many invalid messages arrived whose id could not be read; a long one counts several
+        hears_updates: Whether the robot announced the capability `UPDATES`.
+        topics: By id of a subscription that has not ended: its topic.
+        bad_messages: Number of undecodable messages whose id could not be read; a long one counts several
             times.
-        refused_commands: How many invalid messages arrived whose id could be read, less one for each valid
-            command since.
-        suspicion: The sum of both; a robot with less is read first.
-        tenant: Of the robot, and ``scopes`` of its token; both go into the Welcome.
+        refused_commands: Number of undecodable messages whose id could be read, counted in the same way, less
+            one for each valid command since then.
+        suspicion: The sum of ``bad_messages`` and ``refused_commands``; messages of a robot with a smaller
+            sum are decoded first.
+        tenant: Tenant of the robot, which the Welcome states.
+        scopes: Scopes of the robot's token, which the Welcome states.
     """
 
     def __init__(
@@ -186,9 +196,10 @@ class ServerSession:
         self._next_renewal_s = float("-inf")
 
     def receive_short(self, data: bytes, now: float, max_bytes: int) -> list[Decision] | None:
-        """Return the decisions about one WebSocket message that arrived at *now* (server clock, s).
+        """Decode one WebSocket message that arrived at *now* (server's clock, s), and return the decisions.
 
-        None means that the message has more than *max_bytes* inflated: decode it elsewhere, for `take`.
+        None if the message has more than *max_bytes* inflated: the caller then decodes it in another thread
+        and calls `take`.
         """
         if self.state == "closed":
             return []
@@ -201,7 +212,10 @@ class ServerSession:
         return None if message is None else self.take(message, now)
 
     def take(self, message: FromRobot | ProtocolError, now: float, data: bytes = b"") -> list[Decision]:
-        """Return the decisions about one decoded message, or about the error of decoding *data*."""
+        """Return the decisions about one decoded message, or about the error that decoding *data* raised.
+
+        *now* is the time of the server's clock, s.
+        """
         if self.state == "closed":
             return []
         match message:
@@ -225,13 +239,18 @@ class ServerSession:
                 return self._renew(message.token, now)
 
     def move(self, reason: str, within_ms: float) -> list[Send]:
-        """Ask the robot to connect to another server before it closes this connection."""
+        """Return the message that asks the robot to move to another server within *within_ms* milliseconds.
+
+        The list is empty if the session is not open.
+        """
         return [self._send(Move(reason=reason, within_ms=within_ms))] if self.state == "open" else []
 
     def answer_renewal(self, token_s: float | None) -> Send:
-        """Answer a `Renewal`: the connection lasts *token_s* longer, or (None) the token was refused.
+        """Return the answer to a `Renewal`.
 
-        A refusal has no cause, as in the handshake, and the connection keeps its previous expiry.
+        *token_s* is the number of seconds until the fresh token expires, and the connection with it.  None
+        means that the token was refused: the answer does not say why, and the connection keeps its previous
+        expiry.
         """
         if token_s is not None:
             return self._send(Renewed(token_s=token_s))
@@ -246,12 +265,12 @@ class ServerSession:
         return self._send(self._failure(error, identity=identity))
 
     def _subscribe(self, message: Subscribe) -> list[Decision]:
-        """Begin a subscription; an earlier one with the same id ends."""
+        """Begin the subscription of *message*, or refuse it; an earlier one with the same id ends."""
         if not self.hears_updates:
-            unheard = BadRequest(
+            unannounced = BadRequest(
                 f"this connection did not announce the capability {UPDATES}", hint="name it in hello"
             )
-            return [self._send(self._failure(unheard, identity=message.id))]
+            return [self._send(self._failure(unannounced, identity=message.id))]
         ended: list[Decision] = []
         if self.topics.pop(message.id, None) is not None:
             ended.append(EndUpdates(message.id))
@@ -334,10 +353,11 @@ class ServerSession:
         return [Submit(command)]
 
     def _refuse_undecoded(self, error: ProtocolError, data: bytes) -> list[Decision]:
-        """Answer a message that cannot be decoded, as the answer to its command where its id can be read.
+        """Refuse the message *data*, whose decoding raised *error*.
 
-        With an id the program of the robot made a mistake, and gets the error.  Without an id the client
-        itself is broken, so the connection is closed after `MAX_BAD_MESSAGES`.
+        If its id can be read, the refusal is the answer to this command, because the program of the robot
+        made a mistake.  Without an id the client itself is faulty, so the connection is closed after
+        `MAX_BAD_MESSAGES`.
         """
         identity = undecodable_id(self.codec, data) if self.state == "open" else None
         failure = self._failure(error, identity=identity)
@@ -349,7 +369,10 @@ class ServerSession:
         return sent
 
     def _count(self, sent: list[Decision], size_bytes: int) -> list[Decision]:
-        """Count a bad message that *sent* answers."""
+        """Count an undecodable message without a readable id, which the decisions *sent* answer.
+
+        Returns *sent*, followed by a Close if there were too many such messages.
+        """
         self.bad_messages += _weight(size_bytes)
         self.suspicion += _weight(size_bytes)
         if self.bad_messages > MAX_BAD_MESSAGES:
@@ -365,5 +388,5 @@ class ServerSession:
 
 
 def _weight(size_bytes: int) -> int:
-    """Return how often an undecodable message of *size_bytes* counts."""
+    """Return the number of times that an undecodable message of *size_bytes* counts."""
     return 1 + size_bytes // _BAD_MESSAGE_BYTES

@@ -33,7 +33,7 @@ def asked_at(session: ClientSession, connection: ConnectionState, until: int) ->
     """Return in which seconds the session asked for a fresh token, with a server that answers pings."""
     asked = []
     for now in range(1, until):
-        connection.ping_sent, connection.last_heard = None, float(now)
+        connection.ping_sent, connection.last_received = None, float(now)
         if RenewalDue() in session.check(connection, float(now)):
             asked.append(now)
     return asked
