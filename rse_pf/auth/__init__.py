@@ -1,4 +1,4 @@
-"""Who a robot is and what it may do: tokens, the roster of robots, keys and the store that servers trust.
+"""Who a robot is and what it may do: tokens, the roster of robots, keys, and the store that servers trust.
 
-Rules and files of identity belong here; sockets and HTTP answers do not.
+The rules and the files of identity belong here; sockets and HTTP replies do not.
 """

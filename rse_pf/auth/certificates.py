@@ -1,8 +1,8 @@
 """A certificate authority of one platform, and the server certificates that it issues (X.509, ECDSA P-256).
 
-The authority may certify IP addresses and names under ``local`` only (name constraints), so that a thief of
-its key cannot impersonate other sites to a browser that trusts it.  The caller passes the time, and reads and
-writes the files; keys come from the operating system through `cryptography`.
+The authority may certify IP addresses and names under ``local`` only (name constraints), so that someone who
+steals its key cannot impersonate other sites to a browser that trusts the authority.  The caller passes the
+time, and reads and writes the files; the random numbers of keys come from the operating system.
 
 Source:
     RFC 5280, chapter "Certificate Extensions": subject alternative name, name constraints.
@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 __all__ = ["AUTHORITY_S", "SERVER_S", "CertificateWithKey", "issue_server_certificate", "make_authority"]
 
 AUTHORITY_S = 3650 * 86400
-"""How long an authority is valid: robots keep its certificate."""
+"""Validity of an authority's certificate in seconds: ten years, because robots keep this certificate."""
 SERVER_S = 90 * 86400
-"""How long a server certificate is valid; browsers refuse more than 398 days."""
+"""Validity of a server certificate in seconds: 90 days; browsers refuse more than 398 days."""
 _EARLIER_S = 86400
-"""A certificate is valid from this long before it was made: the clock of a robot may be slow."""
+"""Seconds before its creation from which a certificate is valid, because the clock of a robot may be slow."""
+# Hint of the errors about a damaged file of an authority.
 _HINT = "remove the file; a new one is made, and robots must be enrolled again"
 
 
@@ -43,12 +44,17 @@ class CertificateWithKey:
 
     @property
     def pem(self) -> str:
-        """Certificate and key in one text, as a file holds them."""
+        """The certificate and the private key in one PEM text, as a file holds them; a secret."""
         return self.certificate + self.private_key
 
     @classmethod
     def from_pem(cls, text: str) -> CertificateWithKey:
-        """Return the certificate and key in *text*, which `pem` made; raises UsageError."""
+        """Return the certificate and the key in *text*, which `pem` made.
+
+        Raises:
+            UsageError: The text is damaged, or the key is not that of the certificate.
+            MissingExtra: ``cryptography`` is not installed.
+        """
         certificate, marker, key = text.partition("-----BEGIN PRIVATE KEY-----")
         pair = cls(certificate=certificate, private_key=marker + key)
         pair._read()
@@ -56,12 +62,12 @@ class CertificateWithKey:
 
     @property
     def expires_s(self) -> float:
-        """The Unix time at which the certificate ends."""
+        """The Unix time at which the certificate expires."""
         return self._read()[0].not_valid_after_utc.timestamp()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The addresses and names that the certificate is for; empty for an authority."""
+        """The IP addresses and host names for which the certificate is valid; empty for an authority."""
         x509, _, _ = _cryptography()
         try:
             extension = self._read()[0].extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -71,7 +77,7 @@ class CertificateWithKey:
 
     @property
     def fingerprint(self) -> str:
-        """The SHA-256 of the certificate, in pairs of hexadecimal digits, as browsers show it."""
+        """The SHA-256 of the certificate as browsers show it: pairs of hex digits, joined by colons."""
         _, _, serialization = _cryptography()
         digest = hashlib.sha256(self._read()[0].public_bytes(serialization.Encoding.DER)).hexdigest().upper()
         return ":".join(digest[at : at + 2] for at in range(0, len(digest), 2))
@@ -97,7 +103,9 @@ class CertificateWithKey:
 
 
 def make_authority(name: str, *, now_s: float) -> CertificateWithKey:
-    """Return a new authority for the platform called *name*, valid from *now_s* (Unix) for `AUTHORITY_S`.
+    """Return a new certificate authority for the platform *name*, valid until `AUTHORITY_S` after *now_s*.
+
+    *now_s* is in Unix seconds.
 
     Raises:
         MissingExtra: ``cryptography`` is not installed.
@@ -125,16 +133,18 @@ def make_authority(name: str, *, now_s: float) -> CertificateWithKey:
 def issue_server_certificate(
     authority: CertificateWithKey, names: Sequence[str], *, now_s: float
 ) -> CertificateWithKey:
-    """Return a certificate for *names*, addresses or names under ``local``, valid for `SERVER_S`.
+    """Return a new server certificate for *names* with its key.
+
+    It is valid until `SERVER_S` after *now_s*, but not longer than *authority*.
 
     Args:
-        authority: Signs it.
-        names: What clients may connect to; at least one.
+        authority: The authority that signs the certificate.
+        names: At least one IP address or name under ``local``, to which clients connect.
         now_s: Unix seconds.
 
     Raises:
         MissingExtra: ``cryptography`` is not installed.
-        UsageError: *authority* is damaged.
+        UsageError: The certificate or the key of *authority* is damaged.
     """
     x509, ec, _ = _cryptography()
     signer, signing_key = authority._read()

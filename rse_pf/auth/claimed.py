@@ -17,8 +17,9 @@ from rse_pf.auth.tokens import KeySet
 
 __all__ = ["claimed_by", "source_address"]
 
-_MAX_TOKEN = 8192
-_MAX_CLAIM = 64
+_MAX_TOKEN = 8192  # characters of a token that are read
+_MAX_CLAIM = 64  # characters of each returned value
+# An IPv4 or IPv6 address, the latter perhaps in brackets with a port.
 _ADDRESS = re.compile(r"[0-9a-fA-F.:]{2,45}|\[[0-9a-fA-F.:]{2,45}\]:\d{1,5}")
 
 
@@ -40,14 +41,15 @@ class _Claimed(msgspec.Struct):
 
 
 def claimed_by(token: str, keys: KeySet | None = None) -> dict[str, str]:
-    """Return ``claimed_robot``, ``claimed_tenant``, ``claimed_token`` and, of a robot's own, ``claimed_key``.
+    """Return the names in the unverified *token* as fields for a log; no fields if it is malformed.
 
-    A robot that signs its own tokens may not know its tenant: it is that of the key in the roster, and
-    unknown for a key that is not enrolled.
+    The fields are ``claimed_robot``, ``claimed_tenant``, ``claimed_token`` (the token's id) and, if the token
+    names a robot's own key, ``claimed_key``.  A value that the token lacks is left out.  For a robot's own
+    key the tenant is that of the key in the roster; it is left out if the key is not enrolled.
 
     Args:
-        token: The token of the request; a value that it lacks is not returned.
-        keys: The key set with the roster; None without one.
+        token: The token of a request.
+        keys: The key set with the roster; None if the server has none.
     """
     parts = token[:_MAX_TOKEN].split(".")
     if len(parts) != 3:
@@ -67,19 +69,19 @@ def claimed_by(token: str, keys: KeySet | None = None) -> dict[str, str]:
 
 
 def _decode(part: str, kind: type[_T]) -> _T:
-    """Return a *part* of a token, without members if it is not JSON."""
+    """Return a *part* of a token decoded as *kind*; with all members None if the part is malformed."""
     with contextlib.suppress(ValueError, msgspec.MsgspecError, RecursionError):
         return msgspec.json.decode(base64.urlsafe_b64decode(part + "=="), type=kind)
     return kind()
 
 
 def source_address(peer: str, forwarded_for: str, trusted_proxies: int) -> str:
-    """Return the address that a request came from.
+    """Return the address of the client that sent a request.
 
     Args:
-        peer: The other end of the TCP connection.
-        forwarded_for: The ``x-forwarded-for`` headers, joined.  Each trusted proxy appended one entry.  Those
-            before may be forged, and an entry that is no address is ignored.
+        peer: Address of the other end of the TCP connection, returned if the headers hold no client address.
+        forwarded_for: The ``x-forwarded-for`` headers, joined by commas.  Each trusted proxy appends one
+            entry; earlier entries may be forged and are ignored.
         trusted_proxies: Number of proxies between clients and this server that append an entry.
     """
     entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]

@@ -15,6 +15,7 @@ from rse_pf.storage.files import OWNER_ONLY, read_private_file, replace_file
 
 __all__ = ["bearer", "carries_token", "ensure_control_token", "read_control_token"]
 
+# The form of a control token; 32 hexadecimal digits are 128 random bits.
 _TOKEN = re.compile(rb"[0-9a-fA-F]{32,256}")
 _CREATE_HINT = "create one: (umask 077; openssl rand -hex 32 > FILE)"
 
@@ -25,9 +26,9 @@ def bearer(token: str) -> str:
 
 
 def carries_token(authorization: str, token: str) -> bool:
-    """Return whether the ``Authorization`` header, empty if there was none, carries *token*.
+    """Return whether *authorization*, the value of the header or "", is ``Bearer`` with *token*.
 
-    The comparison takes the same time wherever the two differ.
+    The comparison takes the same time wherever the tokens differ, so that its time does not help to guess.
     """
     scheme, _, carried = authorization.partition(" ")
     is_same = hmac.compare_digest(carried.encode(), token.encode())
@@ -35,7 +36,7 @@ def carries_token(authorization: str, token: str) -> bool:
 
 
 def read_control_token(path: Path) -> str:
-    """Return the token in *path*.
+    """Return the control token in the file *path*.
 
     Raises:
         UsageError: There is no such file, others may read it, or it holds anything but a token of 32 to 256
@@ -48,9 +49,10 @@ def read_control_token(path: Path) -> str:
 
 
 def ensure_control_token(path: Path, *, seed: bytes) -> str:
-    """Return the token in *path*; create it from *seed* (32 secret random bytes) if there is none.
+    """Return the control token in the file *path*; if there is no such file, write one first.
 
-    An existing token is kept, because servers that are still running use it.
+    The new token is *seed*, 32 secret random bytes, in hexadecimal digits.  An existing token is kept,
+    because servers that are still running use it.
 
     Raises:
         UsageError: The file exists, but `read_control_token` refuses it.

@@ -17,12 +17,12 @@ from rse_pf.storage.files import create_private_file, read_private_file
 
 __all__ = ["RobotKey", "make_robot_key"]
 
-_SEED_BYTES = 32  # of an Ed25519 key
-_ID_BYTES = 12  # of the random id of a token, by which an operator can revoke it
+_SEED_BYTES = 32  # random bytes of which an Ed25519 key is made
+_TOKEN_ID_BYTES = 12  # random bytes of a token's id, by which an operator can revoke the token
 
 
 class RobotKey:
-    """The key in a file that `make_robot_key` wrote, used in the name of one robot."""
+    """The private key of one robot, in a file that `make_robot_key` wrote; it signs the robot's tokens."""
 
     def __init__(
         self,
@@ -32,13 +32,13 @@ class RobotKey:
         settings: AuthSettings | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        """Store the path; the file is read for each token, so a replaced key takes effect at once.
+        """Store the path; the file is read for each token, so that a replaced key takes effect at once.
 
         Args:
-            path: The private key, mode 0600.
-            robot: The name under which the robot was enrolled.
-            settings: Issuer, audience and time to live; None means the defaults.
-            clock: Unix seconds; the platform tolerates ``auth.leeway_s`` of difference.
+            path: File of the private key, with the mode 0600.
+            robot: Name under which the robot was enrolled.
+            settings: Audience and validity of the tokens; None means the defaults.
+            clock: Returns Unix seconds; servers tolerate a difference of ``auth.leeway_s`` from their clock.
         """
         self._path = Path(path)
         self._robot = robot
@@ -46,15 +46,15 @@ class RobotKey:
         self._clock = clock
 
     async def token(self) -> str:
-        """Return a fresh token; raises UsageError if the file holds no key, or others may read it."""
+        """Return a new token; raises UsageError if the file holds no key, or other users may read it."""
         data = read_private_file(self._path, "the key", hint="make one with rse-pf robot keygen")
         key = SigningKey.from_json(data.decode("utf-8", "replace"))
-        token_id = secrets.token_hex(_ID_BYTES)
+        token_id = secrets.token_hex(_TOKEN_ID_BYTES)
         return key.issue(self._robot, now=self._clock(), token_id=token_id, settings=self._settings)
 
 
 def make_robot_key(path: Path) -> str:
-    """Write a new private key to *path*, which must not exist, and return its public half as a JWK.
+    """Write a new private key to the file *path*, which must not exist; return the public key as a JWK.
 
     Raises:
         UsageError: The file exists or cannot be written.

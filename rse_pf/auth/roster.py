@@ -1,7 +1,7 @@
 """The roster, which lists the enrolled robots, and the deny list, which lists refused tokens and robots.
 
-An operator writes both, every server reads both; `rse_pf.auth.trust_store` stores and loads them.  They hold
-public keys, names and times, no secrets.
+An operator changes both lists, and every server reads them; `rse_pf.auth.trust_store` stores and loads them.
+They hold public keys, names and times, no secrets.
 """
 
 from __future__ import annotations
@@ -40,15 +40,17 @@ __all__ = [
 ]
 
 ROBOT_KEY = "robot:"
-"""Prefix of the key ids of robots' own keys; no platform key may have it."""
+"""Prefix of the id of a key that a robot made itself; the id of no platform key may begin with it."""
 QUOTAS = ("data_bytes",)
-"""What an operator may limit for one robot; without a quota the settings apply."""
+"""Names of the quotas that an operator may set for one robot; without one the setting applies, for
+``data_bytes`` (bytes that the robot may store) ``data.quota_bytes``."""
 
 SYNTHETIC = "synthetic"
 """The scope that marks a robot of the platform itself, such as the canary.
 
-It allows nothing.  What a synthetic robot sends is answered, and is not counted as load.
+It allows nothing by itself.  The commands of a synthetic robot are answered, but do not count as load.
 """
+# The form of each valid scope.
 _SCOPE = re.compile(
     r"services:(?:\*|[A-Za-z0-9][A-Za-z0-9._-]{0,63})"
     r"|data:(?:\*|read|write)"
@@ -56,23 +58,30 @@ _SCOPE = re.compile(
     r"|topics:(?:\*|read|write)"
     rf"|{SYNTHETIC}"
 )
+# The form of the member ``x`` of the JWK of an Ed25519 key: 32 bytes in base64url.
 _X = re.compile(r"[A-Za-z0-9_-]{43}")
-_MAX_CHARACTERS = 64  # of a name: it is shown in one line, and part of object names
-_MAX_SCOPES = 64  # of one robot, which its token carries in each handshake
+_MAX_CHARACTERS = 64  # characters of the name of a robot or tenant, which is shown in one line
+_MAX_SCOPES = 64  # scopes of one robot, which its token carries in each handshake
 MAX_ROBOTS_OF_TENANT = 10_000
+"""Robots of one tenant that may be enrolled."""
 MAX_ROSTER_BYTES = 16 << 20
-"""Every worker of every server reads the whole roster when it changes."""
+"""Largest size of the roster in bytes: each worker of each server reads the whole roster when it changes."""
 
 _T = TypeVar("_T", bound=msgspec.Struct)
+# The name of a robot or a tenant.
 Word = Annotated[str, msgspec.Meta(min_length=1, max_length=_MAX_CHARACTERS)]
 
 
 class _Value(msgspec.Struct, frozen=True, kw_only=True):
-    """Unknown fields are ignored, for compatibility with newer versions of the operator's commands."""
+    """The base of all stored values; unknown fields are ignored, which a newer version may have written."""
 
 
 class EnrolledRobot(_Value, frozen=True, kw_only=True):
-    """A robot with a key of its own.  ``x`` is its public Ed25519 key in base64url, as a JWK has it."""
+    """A robot whose public key is enrolled.
+
+    ``x`` is the public Ed25519 key in base64url, as in a JWK; ``enrolled_s`` is the Unix time of enrolment.
+    Empty ``scopes`` allow everything; without an entry in ``quotas`` the setting applies.
+    """
 
     robot: Word
     tenant: Word = "default"
@@ -83,12 +92,12 @@ class EnrolledRobot(_Value, frozen=True, kw_only=True):
 
     @property
     def key_id(self) -> str:
-        """The ``kid`` of the tokens that it signs."""
+        """The key id (``kid``) in the tokens that this robot signs."""
         return key_id_of(self.x)
 
     @property
     def id(self) -> RobotId:
-        """Its identity; another key under the same name is another robot."""
+        """The identity of this robot; with another key, the same name stands for another robot."""
         return RobotId(self.tenant, self.robot, self.key_id.removeprefix(ROBOT_KEY))
 
 
@@ -98,11 +107,11 @@ class Roster(_Value, frozen=True, kw_only=True):
     robots: tuple[EnrolledRobot, ...] = ()
 
     def enrolled(self, robot: EnrolledRobot) -> Roster:
-        """Return the roster with *robot*, which replaces an entry of the same tenant and name.
+        """Return a roster with *robot* added, which replaces an entry of the same tenant and name.
 
         Raises:
-            UsageError: Another robot has this key, or a name that looks the same; or the tenant has as many
-                robots as it may have.
+            UsageError: Another robot has this key, another robot of the tenant has a name that an operator
+                could confuse with this one, or the tenant has `MAX_ROBOTS_OF_TENANT` already.
         """
         others = tuple(r for r in self.robots if (r.tenant, r.robot) != (robot.tenant, robot.robot))
         shared_form = _shared_form(robot.robot)
@@ -126,12 +135,12 @@ class Roster(_Value, frozen=True, kw_only=True):
         return Roster(robots=(*others, robot))
 
     def find(self, tenant: str, robot: str) -> EnrolledRobot | None:
-        """Return the entry of this tenant and name, None if there is none."""
+        """Return the entry of the robot with this tenant and name, None if it is not enrolled."""
         return next((r for r in self.robots if (r.tenant, r.robot) == (tenant, robot)), None)
 
 
 class RevokedToken(_Value, frozen=True, kw_only=True):
-    """One token that is refused until it expires."""
+    """One token that is refused, with the Unix time at which it expires anyway."""
 
     tenant: str
     robot: str
@@ -140,7 +149,7 @@ class RevokedToken(_Value, frozen=True, kw_only=True):
 
 
 class DisabledRobot(_Value, frozen=True, kw_only=True):
-    """A robot that is refused with any token."""
+    """A robot that is refused with every token, since the Unix time ``since_s``."""
 
     tenant: str
     robot: str
@@ -148,7 +157,7 @@ class DisabledRobot(_Value, frozen=True, kw_only=True):
 
 
 class NotBefore(_Value, frozen=True, kw_only=True):
-    """Tokens of this robot that were issued earlier are refused."""
+    """The cut-off of one robot: tokens that were issued before the Unix time ``at_s`` are refused."""
 
     tenant: str
     robot: str
@@ -156,18 +165,18 @@ class NotBefore(_Value, frozen=True, kw_only=True):
 
 
 class DenyList(_Value, frozen=True, kw_only=True):
-    """Tokens and robots that are refused although the signature is valid."""
+    """The tokens and robots that servers refuse although the signature is valid."""
 
     tokens: tuple[RevokedToken, ...] = ()
     disabled: tuple[DisabledRobot, ...] = ()
     not_before: tuple[NotBefore, ...] = ()
 
     def pruned(self, *, now: float, max_token_s: float) -> DenyList:
-        """Return the list without the entries that only concern expired tokens.
+        """Return the list without the entries that concern expired tokens only; disabled robots are kept.
 
         Args:
             now: Unix seconds.
-            max_token_s: The longest time for which a token is valid, leeway included.
+            max_token_s: Longest validity of a token in seconds, with the leeway.
         """
         return DenyList(
             tokens=tuple(token for token in self.tokens if token.expires_s + max_token_s >= now),
@@ -176,26 +185,26 @@ class DenyList(_Value, frozen=True, kw_only=True):
         )
 
     def with_token(self, tenant: str, robot: str, token_id: str, expires_s: float) -> DenyList:
-        """Return the list with one more token."""
+        """Return the list with one more refused token."""
         fresh = RevokedToken(tenant=tenant, robot=robot, id=token_id, expires_s=expires_s)
         return msgspec.structs.replace(self, tokens=(*(t for t in self.tokens if t != fresh), fresh))
 
     def with_tokens_before(self, tenant: str, robot: str, at_s: float) -> DenyList:
-        """Return the list that refuses tokens of *robot* issued before *at_s*; a later time is kept."""
+        """Return the list with the cut-off *at_s* for *robot*; an existing later cut-off is kept."""
         others = tuple(n for n in self.not_before if (n.tenant, n.robot) != (tenant, robot))
         earlier = [n.at_s for n in self.not_before if n not in others]
         fresh = NotBefore(tenant=tenant, robot=robot, at_s=max([at_s, *earlier]))
         return msgspec.structs.replace(self, not_before=(*others, fresh))
 
     def with_robot(self, tenant: str, robot: str, since_s: float) -> DenyList:
-        """Return the list with *robot* disabled."""
+        """Return the list with *robot* disabled since *since_s*; an existing entry is kept."""
         if self.is_disabled(tenant, robot):
             return self
         fresh = DisabledRobot(tenant=tenant, robot=robot, since_s=since_s)
         return msgspec.structs.replace(self, disabled=(*self.disabled, fresh))
 
     def without_robot(self, tenant: str, robot: str) -> DenyList:
-        """Return the list with *robot* enabled again."""
+        """Return the list in which *robot* is not disabled any more."""
         others = tuple(d for d in self.disabled if (d.tenant, d.robot) != (tenant, robot))
         return msgspec.structs.replace(self, disabled=others)
 
@@ -205,7 +214,7 @@ class DenyList(_Value, frozen=True, kw_only=True):
 
 
 def from_json(data: bytes | str, kind: type[_T]) -> _T:
-    """Return the `Roster` or `DenyList` in *data*; raises ConfigurationError."""
+    """Return the `Roster` or `DenyList` in JSON *data*; raises ConfigurationError if it is damaged."""
     try:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -216,13 +225,13 @@ def from_json(data: bytes | str, kind: type[_T]) -> _T:
 
 
 def to_json(value: Roster | DenyList) -> bytes:
-    """Return *value* as it is stored."""
+    """Return *value* as the JSON in which it is stored."""
     return msgspec.json.format(msgspec.json.encode(value), indent=1) + b"\n"
 
 
 @functools.lru_cache(maxsize=1 << 17)
 def key_id_of(x: str) -> str:
-    """Return the key id of a robot's public key.
+    """Return the key id of the robot's public key *x* (base64url): `ROBOT_KEY` and the key's thumbprint.
 
     Source:
         RFC 7638: the sha256 of the required members of the JWK, in lexical order.
@@ -233,7 +242,11 @@ def key_id_of(x: str) -> str:
 
 
 def public_key_of(text: str) -> str:
-    """Return ``x`` of a public JWK; raises UsageError, above all for a private key."""
+    """Return the member ``x`` of the public Ed25519 JWK *text*.
+
+    Raises:
+        UsageError: *text* is not such a JWK, or holds a private key.
+    """
     hint = "give the public key that rse-pf robot keygen printed"
     try:
         jwk = json.loads(text)
@@ -248,9 +261,13 @@ def public_key_of(text: str) -> str:
 
 
 def scopes_allow(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
-    """Return whether *scopes* allow *right*, such as ``services:pnp`` or ``maps:write``, on object *name*.
+    """Return whether *scopes* allow *right*, such as ``services:pnp`` or ``maps:write``.
 
-    An empty list allows everything; otherwise only what is listed is allowed.
+    Args:
+        scopes: The scopes of a robot.  If there are none, everything is allowed.
+        right: Area and right.  A scope with ``*`` as its right allows all rights of its area.
+        name: Name of a map, for the rights of maps.  A scope such as ``maps:write/NAME`` allows the right on
+            this map only; with "" such scopes allow nothing.
     """
     if not scopes:
         return True
@@ -263,31 +280,34 @@ def scopes_allow(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
 
 
 def check_robot(name: str) -> str:
-    """Return *name*; raises UsageError if it cannot be the name of a robot."""
+    """Return *name*; raises UsageError if it is not 1 to 64 printable characters, as for a robot."""
     return _check_name(name, "robot")
 
 
 def check_tenant(name: str) -> str:
-    """Return *name*; raises UsageError if it cannot be the name of a tenant."""
+    """Return *name*; raises UsageError if it is not 1 to 64 printable characters, as for a tenant."""
     return _check_name(name, "tenant")
 
 
 @functools.lru_cache(maxsize=1 << 17)
 def _shared_form(name: str) -> str:
-    """Return a form of *name* that all names share which an operator can hardly tell apart."""
+    """Return *name* without differences of case, spaces and forms of letters.
+
+    Names with the same result look the same to an operator.
+    """
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
-def _check_name(name: str, owner: str) -> str:
+def _check_name(name: str, kind: str) -> str:
     if not 0 < len(name) <= _MAX_CHARACTERS or not name.isprintable():
         raise UsageError(
-            f"{name[:80]!r} is not a valid name for a {owner}", hint="use 1 to 64 printable characters"
+            f"{name[:80]!r} is not a valid name for a {kind}", hint="use 1 to 64 printable characters"
         )
     return name
 
 
 def check_scopes(scopes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return *scopes*; raises UsageError if one of them is invalid, or if there are too many."""
+    """Return *scopes*; raises UsageError if a scope is malformed, or there are more than `_MAX_SCOPES`."""
     for scope in scopes:
         if not _SCOPE.fullmatch(scope):
             raise UsageError(
@@ -302,7 +322,7 @@ def check_scopes(scopes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def check_quotas(quotas: dict[str, float]) -> dict[str, float]:
-    """Return *quotas*; raises UsageError for an unknown name or an invalid number."""
+    """Return *quotas*, limits by name; raises UsageError for an unknown name, or a limit not above 0."""
     for name, limit in quotas.items():
         if name not in QUOTAS:
             raise UsageError(f"{name[:80]!r} is not a quota", hint=f"known are {', '.join(QUOTAS)}")

@@ -1,9 +1,10 @@
-"""Robot tokens: issue, verify, and why one is refused; Ed25519-signed JWTs after the RFC 8725 profile.
+"""Issue and verify robot tokens: JWTs with an Ed25519 signature, by the best practices of RFC 8725.
 
-PyJWT verifies the signature and the standard claims; the algorithm is fixed, never read from a token.  Here
-are the look-up of the key by ``kid``, the roster, the deny list, and the rules of time, because the time is
-an argument.  A robot that is enrolled signs its own tokens; its tenant, scopes and quotas then come from the
-roster.  A caller only sees `Unauthorized`, whatever the cause; `token_problem` returns the cause for the log.
+PyJWT verifies the signature, the issuer and the audience; the algorithm is fixed, never read from a token.
+This module looks up the key by ``kid``, applies the roster and the deny list, and checks the times of a token
+against the time that the caller passes.  An enrolled robot signs its own tokens; its tenant, scopes and
+quotas come from the roster.  A refusal is always `Unauthorized` with the same message; `token_problem`
+returns the cause for the log.
 """
 
 from __future__ import annotations
@@ -49,24 +50,30 @@ __all__ = [
 ]
 
 ISSUER = "rse-pf"
-"""Issuer (iss) of every token; ``auth.audience`` distinguishes platforms."""
-_ALGORITHM = "EdDSA"
-_TYPE = "robot+jwt"
+"""Issuer (``iss``) of every token; ``auth.audience`` distinguishes platforms."""
+_ALGORITHM = "EdDSA"  # the only accepted algorithm of a signature
+_TYPE = "robot+jwt"  # type (``typ``) in the header of every token
 _CHECKS = {
     "require": ["iss", "aud", "sub", "exp", "iat", "jti"],
     "verify_exp": False, "verify_iat": False, "verify_nbf": False,
 }  # fmt: skip
-"""Options of PyJWT: the times are checked here, because PyJWT would take them from the machine's clock."""
+"""Options of PyJWT: it does not check times, because it would compare them with the machine's clock; see
+`_check_times`."""
 _EXTENSIONS = ("crit", "b64")
-"""Members of a header that would change how the token is read (RFC 7515, 4.1.11; RFC 7797)."""
-# A longer token is refused unread.
+"""Members of a header that would change the meaning of a token (RFC 7515, 4.1.11; RFC 7797); a token with one
+of them is refused."""
+# Longest accepted token in bytes; a longer one is refused before it is decoded.
 _MAX_TOKEN_BYTES = 4096
 _MAX_REMEMBERED = 8192
-"""Tokens of a key set whose signature is not verified again; about 1 kB each."""
+"""Verified tokens that a key set remembers, so that it need not verify their signatures again; each takes
+about 1 kB."""
 
 
 class Claims(msgspec.Struct, frozen=True, kw_only=True):
-    """The claims of a verified token, the only source of a robot's identity."""
+    """The claims of a verified token, the only source of a robot's identity.
+
+    ``quotas`` are pairs of name and limit; times are Unix seconds.
+    """
 
     robot: RobotId
     token_id: str
@@ -77,12 +84,15 @@ class Claims(msgspec.Struct, frozen=True, kw_only=True):
     quotas: tuple[tuple[str, float], ...] = ()
 
     def quota(self, name: str) -> float | None:
-        """Return the robot's quota in the roster, None if there is none; see `rse_pf.auth.roster.QUOTAS`."""
+        """Return the limit of the quota *name*, one of `rse_pf.auth.roster.QUOTAS`; None if none is set."""
         return dict(self.quotas).get(name)
 
 
 class _SignedClaims(NamedTuple):
-    """The claims of a token with a valid signature, issuer and audience; its times are not checked yet."""
+    """The claims of a token with a valid signature, issuer and audience; its times are not checked yet.
+
+    ``starts_s`` is the Unix time before which the token is not valid (``nbf``), 0 if it states none.
+    """
 
     claims: Claims
     starts_s: float
@@ -90,10 +100,13 @@ class _SignedClaims(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProvenRefusal:
-    """Why a token is refused that was signed with the key of an enrolled robot, which may learn the reason.
+    """Why a token was refused that was signed with the key of an enrolled robot, which may learn the reason.
 
-    ``off_s`` is how far the token's time is from the server's: ahead of it if it is not yet valid, behind it
-    if it has expired.  ``valid_from_s`` is the Unix time from which tokens are accepted after a cut-off.
+    Attributes:
+        cause: The cause, one of the words of `token_problem`.
+        off_s: For an expired token the seconds since it expired, otherwise the seconds until it begins to be
+            valid; both by the server's clock.
+        valid_from_s: The cut-off, in Unix seconds, before which the token was issued; None for other causes.
     """
 
     cause: str
@@ -102,7 +115,7 @@ class ProvenRefusal:
 
 
 class SigningKey:
-    """A private key, which issues tokens; stored in one file of mode 0600, or in a secret."""
+    """A private Ed25519 key that signs tokens; it is stored in a file with the mode 0600, or as a secret."""
 
     def __init__(self, private: Ed25519PrivateKey, key_id: str) -> None:
         self._private = private
@@ -110,18 +123,21 @@ class SigningKey:
 
     @classmethod
     def from_seed(cls, seed: bytes, key_id: str) -> SigningKey:
-        """Return the key of 32 secret random bytes."""
+        """Return the key that is made of *seed*, 32 secret random bytes, under the id *key_id*."""
         return cls(_ed25519().Ed25519PrivateKey.from_private_bytes(seed), key_id)
 
     @classmethod
     def of_robot(cls, seed: bytes) -> SigningKey:
-        """Return a robot's own key, made of 32 secret random bytes; its id is its RFC 7638 thumbprint."""
+        """Return a robot's own key, made of *seed*, 32 secret random bytes.
+
+        Its id is `rse_pf.auth.roster.key_id_of` of its public key.
+        """
         private = _ed25519().Ed25519PrivateKey.from_private_bytes(seed)
         return cls(private, key_id_of(_b64(private.public_key().public_bytes_raw())))
 
     @classmethod
     def from_json(cls, text: str | bytes) -> SigningKey:
-        """Return the key that `to_json` wrote; raises UsageError."""
+        """Return the key in *text*, which `to_json` wrote; raises UsageError if it is damaged."""
         try:
             document = json.loads(text)
             return cls.from_seed(_unb64(document["d"]), str(document["kid"]))
@@ -133,7 +149,7 @@ class SigningKey:
         return json.dumps({**self._public_jwk(), "d": _b64(self._private.private_bytes_raw())})
 
     def key_set(self) -> KeySet:
-        """Return the public half as a key set."""
+        """Return a key set that holds only the public key of this key."""
         return KeySet({self.key_id: self._private.public_key()})
 
     def issue(
@@ -147,7 +163,20 @@ class SigningKey:
         scopes: tuple[str, ...] = (),
         tenant: str = DEFAULT_TENANT,
     ) -> str:
-        """Return a token for *robot* that is valid from *now* (Unix seconds) for *ttl_s*."""
+        """Return a new token for *robot*, signed with this key.
+
+        Args:
+            robot: Name of the robot.
+            now: Unix seconds from which the token is valid.
+            token_id: Id of the token (``jti``), 1 to 64 characters; an operator revokes the token by it.
+            settings: Audience and longest validity of a token.
+            ttl_s: Validity in seconds; None means ``auth.token_ttl_s``, which is also the maximum.
+            scopes: What the robot may do; empty allows everything.
+            tenant: Tenant of the robot.
+
+        Raises:
+            UsageError: An argument is invalid.
+        """
         check_robot(robot)
         check_tenant(tenant)
         check_scopes(scopes)
@@ -174,7 +203,7 @@ class SigningKey:
         return token
 
     def public_json(self) -> str:
-        """Return the public half as a JWK."""
+        """Return the public key as a JWK."""
         return json.dumps(self._public_jwk())
 
     def _public_jwk(self) -> dict[str, str]:
@@ -186,7 +215,7 @@ class SigningKey:
 
 
 class KeySet:
-    """The keys and enrolled robots that a server trusts, less the tokens and robots that are denied."""
+    """The platform keys and the enrolled robots that a server trusts, and the denied tokens and robots."""
 
     def __init__(
         self,
@@ -202,22 +231,24 @@ class KeySet:
         self._disabled = {(robot.tenant, robot.robot) for robot in denied.disabled}
         self._not_before = {(limit.tenant, limit.robot): limit.at_s for limit in denied.not_before}
         self._robot_keys: dict[str, Ed25519PublicKey] = {}
-        """Keys of enrolled robots that have signed a token."""
+        """Key objects of enrolled robots by key id, each created when the robot's first token is verified."""
         self._enrolled: dict[str, tuple[RobotId, tuple[tuple[str, float], ...]]] = {}
         """Identity and quotas of enrolled robots that had a valid token, by key id."""
         self._signed: dict[bytes, _SignedClaims] = {}
+        """The claims of the remembered tokens, by digest of the token."""
         self._digests: dict[RobotId, bytes] = {}
+        """The digest of the remembered token of each robot."""
 
     def with_access_control(self, roster: Roster, denied: DenyList) -> KeySet:
-        """Return the same platform keys with another roster and deny list."""
+        """Return a new key set with the same platform keys, and with *roster* and *denied*."""
         return KeySet(self._keys, roster=roster, denied=denied)
 
     @classmethod
     def from_json(cls, text: str) -> KeySet:
-        """Return the set written as a JWKS; raises UsageError.
+        """Return the platform keys in the JWKS *text*; raises UsageError if it is damaged.
 
-        It imports PyJWT, in 0.1 s: a server reads its keys before it forks its workers, and before its first
-        client.
+        This also imports PyJWT, which takes 0.1 s, so that a server does not import it at its first client: a
+        server reads its keys before it forks its workers.
         """
         _jwt()
         public = _ed25519().Ed25519PublicKey
@@ -232,7 +263,7 @@ class KeySet:
             raise UsageError("this is not a key set", hint="write a JWKS of Ed25519 keys") from error
 
     def to_json(self) -> str:
-        """Return the set as a JWKS."""
+        """Return the platform keys as a JWKS, without roster and deny list."""
         keys = [
             {"kty": "OKP", "crv": "Ed25519", "kid": kid, "x": _b64(key.public_bytes_raw())}
             for kid, key in self._keys.items()
@@ -240,7 +271,10 @@ class KeySet:
         return json.dumps({"keys": keys})
 
     def get(self, key_id: Any) -> Ed25519PublicKey | None:
-        """Return the key called *key_id*, of the platform or of an enrolled robot, if it is in the set."""
+        """Return the public key with the id *key_id*, of the platform or of an enrolled robot.
+
+        None if the set has no such key, or *key_id* is not a text.
+        """
         if not isinstance(key_id, str):
             return None
         if not key_id.startswith(ROBOT_KEY):
@@ -252,7 +286,10 @@ class KeySet:
         return key
 
     def as_enrolled(self, claims: Claims, enrolled: EnrolledRobot) -> Claims:
-        """Return *claims* with what the roster says of the robot *enrolled*; a token says nothing of it."""
+        """Return *claims* with the identity, scopes and quotas that the roster has for the robot *enrolled*.
+
+        What the robot's own token states about its tenant and scopes is replaced.
+        """
         known = self._enrolled.get(claims.key_id)
         if known is None:
             known = self._enrolled[claims.key_id] = (enrolled.id, tuple(enrolled.quotas.items()))
@@ -265,22 +302,23 @@ class KeySet:
         )  # fmt: skip
 
     def knows(self, key_id: str) -> bool:
-        """Return whether `get` would find the key, without the cost of creating it."""
+        """Return whether the set has the key *key_id*, without the cost of creating a key object."""
         return key_id in (self._robots if key_id.startswith(ROBOT_KEY) else self._keys)
 
     def robot_of(self, key_id: str) -> EnrolledRobot | None:
-        """Return the enrolled robot whose key is *key_id*."""
+        """Return the enrolled robot with the key *key_id*, None if there is none."""
         return self._robots.get(key_id)
 
     def find_verified(self, digest: bytes) -> _SignedClaims | None:
-        """Return the claims of the token with this *digest*, None if these keys have not verified it yet."""
+        """Return the claims of the remembered token with this *digest*, None if it is not remembered."""
         return self._signed.get(digest)
 
     def remember(self, digest: bytes, signed: _SignedClaims, robot: RobotId) -> None:
-        """Remember a token of *robot* that is valid now, instead of its former one.
+        """Remember the valid token of *robot* with this *digest*, in place of the robot's former one.
 
-        One token of each robot is remembered, so that a robot cannot displace others; invalid tokens are not
-        remembered.  Another roster or deny list is another key set, which remembers nothing.
+        One token of each robot is remembered, so that a robot cannot displace those of others.  Above
+        `_MAX_REMEMBERED`, the token that was remembered first is forgotten.  After a change of the roster or
+        the deny list a server has a new key set, which remembers no token.
         """
         former = self._digests.pop(robot, None)
         if former is None and len(self._digests) >= _MAX_REMEMBERED:
@@ -290,7 +328,10 @@ class KeySet:
         self._digests[robot], self._signed[digest] = digest, signed
 
     def denies(self, claims: Claims) -> str:
-        """Return why *claims* are denied although their signature is valid; empty if they are not."""
+        """Return why the deny list refuses *claims*; "" if it does not.
+
+        The causes are ``disabled``, ``revoked`` and ``issued-too-early``.
+        """
         robot = (claims.robot.tenant, claims.robot.name)  # an operator denies a name, whatever its key
         if robot in self._disabled:
             return "disabled"
@@ -299,21 +340,21 @@ class KeySet:
         return "issued-too-early" if claims.issued_s < self.valid_from_s(claims.robot) else ""
 
     def valid_from_s(self, robot: RobotId) -> float:
-        """Return since when tokens of *robot* must have been issued, Unix seconds; 0 without a cut-off."""
+        """Return the cut-off of *robot*: Unix seconds before which no token may be issued; 0 without one."""
         return self._not_before.get((robot.tenant, robot.name), 0.0)
 
 
 def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
-    """Return the claims of a valid *token*.
+    """Return the claims of *token*, if it is valid.
 
     Args:
-        token: The part of the header after ``Bearer``.
-        keys: Keys that may sign.
+        token: The token, which is the part of the header Authorization after ``Bearer``.
+        keys: The keys that may sign tokens, with the roster and the deny list.
         now: Unix seconds.
-        settings: Issuer, audience, maximum time to live, leeway.
+        settings: Audience, longest validity, and tolerated difference of clocks.
 
     Raises:
-        Unauthorized: Always with the same message; see `token_problem` for the cause.
+        Unauthorized: The token is not valid; the message does not say why, see `token_problem`.
     """
     try:
         return _check(token, keys, now, settings)
@@ -324,9 +365,9 @@ def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings
 
 
 def claims_problem(claims: Claims, keys: KeySet) -> str:
-    """Return why *claims* that were verified earlier are no longer valid under *keys*; empty if they are.
+    """Return why *claims*, which were verified earlier, are no longer valid with *keys*; "" if they are.
 
-    A connection that was authenticated by them must be closed then.  Expiry is not checked.
+    With a cause the caller has to close the connection that they authenticated.  Expiry is not checked.
     """
     if not keys.knows(claims.key_id):
         return "unknown-key"
@@ -337,13 +378,21 @@ def claims_problem(claims: Claims, keys: KeySet) -> str:
 
 
 def renewed_claims(claims: Claims, keys: KeySet) -> Claims:
-    """Return *claims*, which `claims_problem` allows, with the scopes and quotas of the present roster."""
+    """Return *claims* with the scopes and quotas that the roster in *keys* has now.
+
+    `claims_problem` must have found no problem.  The claims of a token that a platform key signed do not
+    change.
+    """
     enrolled = keys.robot_of(claims.key_id)
     return claims if enrolled is None else keys.as_enrolled(claims, enrolled)
 
 
 def unverified_parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return header and claims of *token* without any verification; raises UsageError."""
+    """Return the header and the claims of *token* without any verification.
+
+    Raises:
+        UsageError: *token* does not have the form of a token.
+    """
     try:
         first, second, _ = token.split(".")
         header, claims = json.loads(_unb64(first)), json.loads(_unb64(second))
@@ -355,18 +404,24 @@ def unverified_parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def token_problem(error: Unauthorized) -> str:
-    """Return the cause of *error*, one of a fixed set of words; for the log only."""
+    """Return the cause of an error of `verify_token`, such as ``expired``; for the log only.
+
+    Returns ``unknown`` for an error that another function raised.
+    """
     return str(error.__cause__) if isinstance(error.__cause__, _TokenRefused) else "unknown"
 
 
 def proven_refusal(error: Unauthorized) -> ProvenRefusal | None:
-    """Return the refusal that the robot may learn from *error*; None if it proved no enrolled key."""
+    """Return what a robot may learn about *error*, an error of `verify_token`.
+
+    None if the robot's token was not signed with an enrolled key.
+    """
     cause = error.__cause__
     return cause.proven if isinstance(cause, _TokenRefused) else None
 
 
 class _TokenRefused(ValueError):
-    """Why a token is refused; one of a fixed set of words."""
+    """A token is refused; the message is the cause, one of a fixed set of words such as ``expired``."""
 
     proven: ProvenRefusal | None = None
 
@@ -411,7 +466,10 @@ def _proven_refusal(
 
 
 def _signed_claims(token: str, keys: KeySet, settings: AuthSettings) -> _SignedClaims:
-    """Return the claims of *token* if its form, signature, issuer and audience are right.
+    """Return the claims of *token* if its form, signature, issuer and audience are valid.
+
+    Raises:
+        _TokenRefused: One of these is not.
 
     Source:
         RFC 7515, 5.2; RFC 7519, 7.2; RFC 8725, 3.
@@ -450,7 +508,7 @@ def _claims_in(claims: dict[str, Any], key_id: str) -> _SignedClaims:
     if not (isinstance(tenant, str) and tenant and isinstance(scope, str)):
         raise _TokenRefused("bad-subject")
     scopes = scope.split()
-    # JSON can hold half a surrogate pair, which no log and no object name can.
+    # JSON may hold half a surrogate pair, which neither a log nor the name of an object can.
     is_printable = "".join((robot, token_id, tenant, *scopes)).isprintable()
     if not (0 < len(robot) <= 64 and 0 < len(token_id) <= 64 and is_printable):
         raise _TokenRefused("bad-subject")

@@ -1,8 +1,9 @@
 """Store the enrolled and the denied robots next to the public keys, and load them in servers.
 
-`AccessControlStore` holds two objects, changed by compare-and-swap only: ``control/robots.json`` and
-``control/deny.json``.  On one machine they lie in the folder of ``keys.json``, in a cloud in its bucket.
-`TrustStore` is a server's view of keys, robots and denials.  When a read fails, it keeps what it knew.
+`AccessControlStore` changes two objects by compare-and-swap only: ``control/robots.json`` and
+``control/deny.json``.  On one machine they lie in the folder of ``keys.json``, on AWS in the artifact bucket
+of ``keys.json``.  `TrustStore` is the copy of keys, roster and deny list that one server uses.  When a read
+fails, the server continues to use the part that it read last.
 """
 
 from __future__ import annotations
@@ -27,42 +28,51 @@ __all__ = [
     "key_set_from_snapshot",
 ]
 
+# Attempts to change an object that other writers change at the same time.
 _MAX_ATTEMPTS = 20
 
 _T = TypeVar("_T", Roster, DenyList)
 REFRESH_S = 0.5
-"""Pause between two reads of deny list and roster, by servers and, before them, by the agents on AWS: a robot
-that is revoked is disconnected within 2 s."""
+"""Seconds between two reads of the deny list and the roster.  A server reads its files, and on AWS an agent
+copies the files from the bucket, so that a robot is disconnected within 2 s after it was revoked."""
 
 
 class AccessControlStore:
-    """The roster and the deny list of one platform."""
+    """The stored roster and deny list of one platform."""
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
 
     def roster(self) -> Roster:
-        """Return the enrolled robots; an empty roster if none was ever written."""
+        """Return the stored roster; an empty one if none was ever written."""
         return self._read(ROBOTS_NAME, Roster)[0]
 
     def deny_list(self) -> DenyList:
-        """Return the denied tokens and robots; an empty list if none was ever written."""
+        """Return the stored deny list; an empty one if none was ever written."""
         return self._read(DENY_NAME, DenyList)[0]
 
     def change_roster(self, edit: Callable[[Roster], Roster]) -> None:
-        """Apply *edit* to the current roster; raises Conflict if others keep changing it.
+        """Replace the roster by what *edit* returns for it; repeat if another writer changed it meanwhile.
 
         Raises:
-            UsageError: The roster would grow above what servers read.
+            Conflict: Other writers changed the roster at each of `_MAX_ATTEMPTS`.
+            UsageError: The roster would grow above `MAX_ROSTER_BYTES`.
         """
         self._change(ROBOTS_NAME, Roster, edit)
 
     def change_deny_list(self, edit: Callable[[DenyList], DenyList]) -> None:
-        """Apply *edit* to the current deny list; raises Conflict if others keep changing it."""
+        """Replace the deny list by what *edit* returns for it; repeat if another writer changed it meanwhile.
+
+        Raises:
+            Conflict: Other writers changed the deny list at each of `_MAX_ATTEMPTS`.
+        """
         self._change(DENY_NAME, DenyList, edit)
 
     def create_missing(self) -> None:
-        """Write missing objects as empty ones, so that readers can distinguish "empty" from "forbidden"."""
+        """Write an empty roster or deny list where there is none.
+
+        Without permission to list objects, S3 answers the read of a missing object like a forbidden read.
+        """
         self.change_roster(lambda roster: roster)
         self.change_deny_list(lambda denied: denied)
 
@@ -92,17 +102,20 @@ class AccessControlStore:
 
 
 class TrustStore:
-    """The keys, robots and denials that one server knows; `refresh` loads what changed.  Blocking.
+    """The keys, the roster and the deny list that one server uses.  Its methods block.
 
-    ``snapshot`` is all of it as JSON, for a server's other processes; see `key_set_from_snapshot`.
-    ``problem`` is what the last `refresh` could not read, empty if it could read everything.
+    Attributes:
+        keys: What `refresh` has read; None before the first successful read.
+        snapshot: The same as JSON, for the server's other processes; see `key_set_from_snapshot`.
+        problem: Which part the last `refresh` could not read, and why; "" if it could read all parts.
     """
 
     def __init__(self, keys_file: Path) -> None:
         """Store the path; nothing is read yet.
 
         Args:
-            keys_file: The JWKS; roster and deny list are in the folder ``control`` next to it.
+            keys_file: File of the platform's public keys, a JWKS; roster and deny list are in the folder
+                ``control`` next to it.
         """
         self.keys: KeySet | None = None
         self.snapshot = ""
@@ -113,7 +126,10 @@ class TrustStore:
         self._found: set[str] = set()
 
     def refresh(self) -> bool:
-        """Read everything; return whether it changed.  A part that cannot be read stays as it was known."""
+        """Read keys, roster and deny list; return whether one of them changed.
+
+        A part that cannot be read stays as it was read last, and ``problem`` says why.
+        """
         self.problem = ""
         parts = dict(self._parts)
         for name, read in (
@@ -138,7 +154,11 @@ class TrustStore:
         return True
 
     def load(self) -> KeySet:
-        """Read everything for the first time; raises ConfigurationError if an existing part is unreadable."""
+        """Read keys, roster and deny list for the first time, and return them.
+
+        Raises:
+            ConfigurationError: There are no keys, or a part exists and cannot be read.
+        """
         self.refresh()
         if self.problem or self.keys is None:
             raise ConfigurationError(
@@ -159,13 +179,18 @@ class TrustStore:
     def _read(self, part: str, name: str, kind: type[Roster] | type[DenyList]) -> str:
         data = self._store.get(name)
         text = data.decode()
-        if text != self._parts.get(part):  # what is known was valid
+        if text != self._parts.get(part):  # an unchanged text has been validated before
             from_json(data, kind)
         return text
 
 
 def key_set_from_snapshot(snapshot: str) -> KeySet:
-    """Return the keys in the ``snapshot`` of a `TrustStore`; raises UsageError or ConfigurationError."""
+    """Return the keys, with roster and deny list, in the ``snapshot`` of a `TrustStore`.
+
+    Raises:
+        UsageError: The keys are damaged.
+        ConfigurationError: The roster or the deny list is damaged.
+    """
     parts = json.loads(snapshot)
     roster = from_json(parts["robots"], Roster)
     return KeySet.from_json(parts["keys"]).with_access_control(roster, from_json(parts["denied"], DenyList))

@@ -1,4 +1,4 @@
-"""Limits of what a robot may use: bytes before decoding, rates, queues, and processes that it crashed.
+"""Limits of what a robot may use: sizes of messages, rates, places in queues, and processes that it crashed.
 
-How many bytes a tenant may store is `rse_pf.storage.quotas`.
+The limits of what robots and tenants may store are in `rse_pf.storage.quotas`.
 """

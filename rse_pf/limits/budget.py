@@ -1,8 +1,8 @@
 """Check untrusted bytes before they are decoded: size, inflated size, nesting, number of values, and memory.
 
-Each decoder of the platform calls these checks first; they raise LimitExceeded or BadMessage.  The limits of
-one kind of input are a `Budget`.  The checks do not decode: bytes that pass may still be malformed, which the
-decoder reports.
+Each decoder of the platform calls these checks before it decodes; they raise LimitExceeded or BadMessage.  A
+`Budget` holds the limits of one kind of input.  The checks do not decode: bytes that pass them may still be
+malformed, which the decoder reports.
 
 Source:
     MessagePack specification, https://github.com/msgpack/msgpack/blob/master/spec.md, "Formats".
@@ -47,39 +47,42 @@ Text = bytes | bytearray
 _Text = TypeVar("_Text", bytes, bytearray, Text)
 
 MESSAGE_INFLATE_RATIO = 100.0
-"""Inflated size over wire size of a robot's message."""
+"""Largest quotient of the inflated size and the transmitted size of a robot's message, where the inflated
+size is above ``session.max_message_bytes``."""
 MESSAGE_DEPTH = 16
-"""Levels of nesting of a robot's message."""
+"""Most levels of nesting of a robot's message."""
 MESSAGE_CONTAINERS = 7000
-"""Lists and maps of a robot's message, at any depth."""
+"""Most lists and maps of a robot's message, counted at all depths."""
 MESSAGE_VALUES = 31_000
-"""Values of a robot's message outside of raw arrays.  The largest request of ``pnp``, 5,000 correspondences
-with their depths in JSON, has 30,000 numbers and less than 100 other values."""
+"""Most values of a robot's message outside of raw arrays.  The largest request of ``pnp``, 5,000
+correspondences with their depths in JSON, has 30,000 numbers and less than 100 other values."""
 MESSAGE_MEMORY_BYTES = 2_000_000
-"""Estimated memory of a decoded JSON message."""
+"""Most bytes of memory that a robot's message in JSON may take when it is decoded, as estimated."""
 LIST_VALUES = 3
-"""How many values a list counts as, by the memory that it takes."""
+"""Number of values that a list counts as, because it takes the memory of so many numbers."""
 MAP_VALUES = 6
-"""How many values a map counts as, by the memory that it takes."""
+"""Number of values that a map counts as, because it takes the memory of so many numbers."""
 
 _PIECE_BYTES = 32768  # a text is inflated and read in pieces of this size, which fit into the cache of a core
-_FLAT_FROM = 32  # a shorter list is read value by value, which then takes less time than a test of the whole
-_NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
+_FLAT_FROM = 32  # values of a list from which on it is tested as a whole: below, value by value is faster
+_NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))  # all bytes but brackets and quotes
 
 _NOT_BACKSLASH = re.compile(rb"[^\\]")
 
-_SHORT_BYTES = 8192  # no JSON text up to this size exceeds a limit of a message but the depth
-_STRING_BYTES = 60  # memory of a string in addition to its characters
-_NUMBER_BYTES = 32  # memory of a number in a list
-_MAX_CHARACTER_BYTES = 7  # memory of one character of a text that is not ASCII
-# msgspec takes up to 10 us for a number of more than 19 significant digits, up to 45 us for one at the ends
-# of the range of float64, and less than 0.1 us for any other.
-_MAX_LONG_NUMBERS = 400  # of a JSON text, which are read in 4 ms
-_MAX_EXTREME_NUMBERS = 200
-_EXTREME_NUMBER = re.compile(rb"[0-9][eE][+-]?0*[0-9]{3}")
-_LONG_RUN = b"0" * 20  # what a long number contains after `_ZEROS`
-_LONG_NUMBER = re.compile(b" 0*1[01]{19}")  # after `_ONES`, without its point
+_SHORT_BYTES = 8192  # a JSON text of up to this size cannot exceed a limit of messages except the depth
+_STRING_BYTES = 60  # estimated memory of a decoded string in addition to its characters
+_NUMBER_BYTES = 32  # estimated memory of a decoded number in a list
+_MAX_CHARACTER_BYTES = 7  # most memory of one byte of a string in a text that is not ASCII or has \u escapes
+# msgspec decodes a number of more than 19 significant digits in up to 10 us, a number at the ends of the
+# range of float64 in up to 45 us, and any other number in less than 0.1 us.
+_MAX_LONG_NUMBERS = 400  # numbers of more than 19 significant digits in a JSON text, decoded in 4 ms
+_MAX_EXTREME_NUMBERS = 200  # numbers with an exponent of three digits in a JSON text, decoded in 9 ms
+_EXTREME_NUMBER = re.compile(rb"[0-9][eE][+-]?0*[0-9]{3}")  # a number with an exponent of three digits
+_LONG_RUN = b"0" * 20  # part of each number with 20 digits, in a text that was translated by `_ZEROS`
+_LONG_NUMBER = re.compile(b" 0*1[01]{19}")  # 20 significant digits, in a text translated by `_ONES`
+# Translates each digit and the decimal point to 0, and all other bytes to a space.
 _ZEROS = bytes(ord("0") if k in b"0123456789." else ord(" ") for k in range(256))
+# Translates the digit 0 to 0, each other digit to 1, and all other bytes to a space.
 _ONES = bytes(ord("0") if k == ord("0") else ord("1") if k in b"123456789" else ord(" ") for k in range(256))
 
 
@@ -88,17 +91,18 @@ class Budget:
     """The limits of one kind of input.
 
     Attributes:
-        wire_bytes: Size as received.
-        inflated_bytes: Size after inflating.
-        inflate_ratio: Inflated size over wire size, where the inflated size is above `free_bytes`.
-        free_bytes: Inflated size that is allowed at any ratio.
-        depth: Levels of nesting; a list of numbers has one.
-        containers: Lists and maps, at any depth.
-        values: Values outside of raw arrays; a list counts as `LIST_VALUES`, a map as `MAP_VALUES`, and a
-            long text or a raw array as two.
-        mixed_values: MessagePack only: those of the values that are not in a flat list of numbers of one
-            kind, and therefore have to be read one by one.
-        memory_bytes: JSON only: estimated memory of the decoded objects.
+        wire_bytes: Largest size as received.
+        inflated_bytes: Largest size after inflating.
+        inflate_ratio: Largest quotient of inflated and received size, if the inflated size is above
+            ``free_bytes``.
+        free_bytes: Inflated size up to which any such quotient is allowed.
+        depth: Most levels of nesting; a list of numbers has one level.
+        containers: Most lists and maps, counted at all depths.
+        values: Most values outside of raw arrays.  A list counts as `LIST_VALUES`, a map as `MAP_VALUES`, and
+            a long text or a raw array as two.
+        mixed_values: MessagePack only: most values that are not in a flat list of numbers of one type, and
+            therefore have to be read one by one.
+        memory_bytes: JSON only: largest estimated memory of the decoded values.
     """
 
     wire_bytes: int
@@ -113,7 +117,7 @@ class Budget:
 
     @classmethod
     def of_messages(cls, session: SessionSettings) -> Budget:
-        """Return the budget of a robot's message, also in an event of the Lambda."""
+        """Return the limits of a robot's message, on a WebSocket or in an event of the Lambda function."""
         return cls(
             wire_bytes=session.max_message_bytes, inflated_bytes=session.max_inflated_bytes,
             inflate_ratio=MESSAGE_INFLATE_RATIO, free_bytes=session.max_message_bytes,
@@ -123,7 +127,7 @@ class Budget:
 
 
 def _plain_budget(*, size: int, depth: int, containers: int, values: int, mixed_values: int) -> Budget:
-    """Return the budget of bytes that are not deflated."""
+    """Return the limits of bytes that are not compressed; *size* also limits the memory."""
     return Budget(
         wire_bytes=size, inflated_bytes=size, inflate_ratio=1.0, free_bytes=size, depth=depth,
         containers=containers, values=values, mixed_values=mixed_values, memory_bytes=size,
@@ -131,17 +135,17 @@ def _plain_budget(*, size: int, depth: int, containers: int, values: int, mixed_
 
 
 PROVENANCE = _plain_budget(size=1 << 20, depth=64, containers=40_000, values=150_000, mixed_values=150_000)
-"""Where a map comes from, as its author wrote it."""
+"""Limits of the provenance of a map: what its author states about where the map comes from."""
 
 SERVICE_REPLY = _plain_budget(size=1 << 26, depth=32, containers=7000, values=150_000, mixed_values=30_000)
-"""What an installed service answers, with its snapshot; the size is that of the channel."""
+"""Limits of the reply of a sandboxed service, with the snapshot of its state."""
 
 
-# --- size and inflating ---------------------------------------------------------------------------
+# --- checks of the size as received, and inflating within limits ------------------------------------
 
 
 def check_size(data: bytes, budget: Budget) -> None:
-    """Raise LimitExceeded if *data* is longer on the wire than *budget* allows."""
+    """Raise LimitExceeded if *data*, as it was received, is longer than ``wire_bytes`` of *budget*."""
     if len(data) > budget.wire_bytes:
         raise LimitExceeded(
             f"a message of {len(data)} bytes is above {budget.wire_bytes}",
@@ -153,16 +157,16 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
     """Return the inflated bytes of the zlib stream *data*.
 
     Raises:
-        LimitExceeded: It is longer than *budget* allows; no more than that was inflated.
-        BadMessage: It is not one complete zlib stream.
+        LimitExceeded: The result would be longer than *budget* allows; at most one byte more was inflated.
+        BadMessage: *data* is not exactly one complete zlib stream.
     """
-    # The ratio limits large results only: a text of an allowed size is accepted at any ratio.
+    # The ratio limits large results only: up to free_bytes any ratio is allowed.
     plain = budget.free_bytes
     max_bytes = min(budget.inflated_bytes, max(plain, int(len(data) * budget.inflate_ratio)))
     first = int(plain / budget.inflate_ratio)
     stream = zlib.decompressobj()
     try:
-        # A decompression bomb is detected here, at a quarter of the cost of inflating all that is allowed.
+        # A decompression bomb is detected here, in a quarter of the time of inflating all that is allowed.
         head = stream.decompress(data[:first], min(plain, max_bytes) + 1)
         if len(head) > min(plain, max_bytes):
             raise _bomb_error(len(data), min(plain, max_bytes))
@@ -175,16 +179,16 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
 
 
 def inflate_short(data: bytes, budget: Budget, library: ModuleType) -> bytes:
-    """Return the inflated bytes of the short zlib stream *data*.
+    """Return the inflated bytes of the short zlib stream *data*, with fewer calls than `inflate_within`.
 
     Args:
         data: One zlib stream of a few kB.
         budget: The limits.
-        library: ``zlib``, or ``isal.isal_zlib``.
+        library: Module that inflates: ``zlib``, or ``isal.isal_zlib``.
 
     Raises:
-        LimitExceeded: It is longer than *budget* allows; no more than that was inflated.
-        BadMessage: It is not one complete zlib stream.
+        LimitExceeded: The result would be longer than *budget* allows; at most one byte more was inflated.
+        BadMessage: *data* is not exactly one complete zlib stream.
     """
     plain_bytes = min(budget.free_bytes, budget.inflated_bytes)
     max_bytes = min(budget.inflated_bytes, max(plain_bytes, int(len(data) * budget.inflate_ratio)))
@@ -203,17 +207,23 @@ def inflate_short(data: bytes, budget: Budget, library: ModuleType) -> bytes:
 
 
 def inflate_up_to(data: bytes, max_bytes: int, library: ModuleType = zlib) -> bytes | None:
-    """Return the inflated bytes of the zlib stream *data*, None if they are more than *max_bytes*.
+    """Return the inflated bytes of the zlib stream *data*, None if there are more than *max_bytes*.
+
+    *library* is the module that inflates: ``zlib`` or ``isal.isal_zlib``.
 
     Raises:
-        BadMessage: It is not one complete zlib stream.
+        BadMessage: *data* is not exactly one complete zlib stream.
     """
     text, stream = _inflated(data, max_bytes + 1, library)
     return None if len(text) > max_bytes else _whole(text, stream, len(data), max_bytes)
 
 
 def _inflated(data: bytes, max_bytes: int, library: ModuleType) -> tuple[bytes, Any]:
-    """Return the first *max_bytes* that *data* inflates to, and the stream that inflated them."""
+    """Return the first *max_bytes* to which *data* inflates, and the decompression object.
+
+    Raises:
+        BadMessage: *data* is not a zlib stream.
+    """
     stream = library.decompressobj()
     try:
         return stream.decompress(data, max_bytes), stream
@@ -222,7 +232,12 @@ def _inflated(data: bytes, max_bytes: int, library: ModuleType) -> tuple[bytes, 
 
 
 def _whole(text: _Text, stream: Any, size: int, max_bytes: int) -> _Text:
-    """Return *text*, which *stream* inflated from *size* bytes, if it is complete and not too long."""
+    """Return *text*, which the decompression object *stream* inflated from *size* bytes, if it is complete.
+
+    Raises:
+        LimitExceeded: *text* is longer than *max_bytes*.
+        BadMessage: The zlib stream is incomplete, or bytes follow it.
+    """
     if len(text) > max_bytes:
         raise _bomb_error(size, max_bytes)
     if not stream.eof or stream.unused_data:
@@ -231,7 +246,10 @@ def _whole(text: _Text, stream: Any, size: int, max_bytes: int) -> _Text:
 
 
 def _inflate_rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: int) -> bytearray:
-    """Inflate *data* from *first* piece by piece, because zlib would hold the text twice otherwise."""
+    """Return *head* and the bytes to which *data* inflates from byte *first* on, up to *max_bytes* + 1.
+
+    *data* is inflated piece by piece, because zlib would otherwise hold the text twice in memory.
+    """
     text = bytearray(head)
     piece = stream.unconsumed_tail
     while len(text) <= max_bytes and not stream.eof:
@@ -262,19 +280,19 @@ def _bomb_error(size: int, max_bytes: int) -> LimitExceeded:
     return LimitExceeded(f"{size} bytes inflate to more than {max_bytes}", hint="send smaller messages")
 
 
-# --- MessagePack ----------------------------------------------------------------------------------
+# --- checks of MessagePack --------------------------------------------------------------------------
 
 
 def check_msgpack(data: Text, budget: Budget) -> bool:
-    """Check the counts and the depth of the one MessagePack value that *data* holds.
+    """Check the numbers of values and containers and the depth of the MessagePack value *data*.
 
     Returns:
-        Whether *data* was read.  A message too short to exceed a count is not, because reading it takes as
-        long as decoding it, and the decoder refuses deep nesting by itself.
+        Whether *data* was checked.  False for a message that is too short to exceed a number: checking it
+        would take as long as decoding it, so the caller checks the depth of the decoded value instead.
 
     Raises:
-        LimitExceeded: It holds more values, lists or levels than *budget* allows.
-        BadMessage: It ends within a value, or bytes follow it.
+        LimitExceeded: *data* holds more values, lists or levels than *budget* allows.
+        BadMessage: *data* ends within a value, or bytes follow the value.
     """
     end = len(data)
     if end <= budget.containers and end * MAP_VALUES <= budget.mixed_values:
@@ -285,15 +303,15 @@ def check_msgpack(data: Text, budget: Budget) -> bool:
 
 
 def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
-    """Return where the MessagePack value that begins at byte *at* ends, within *budget*.
+    """Return the index of the byte after the MessagePack value that begins at byte *at* of *data*.
 
     Raises:
-        LimitExceeded: It holds more values, lists or levels than *budget* allows.
-        BadMessage: *data* ends within it.
+        LimitExceeded: The value holds more values, lists or levels than *budget* allows.
+        BadMessage: *data* ends within the value.
     """
     end, steps, limit = len(data), _STEPS, budget.mixed_values
     values = containers = 0
-    outer: list[int] = []  # of each list or map that is open: how many values follow this one in it
+    outer: list[int] = []  # for each list or map around the present one: its values that are still to be read
     values_left = 1
     while True:
         while values_left:
@@ -338,10 +356,12 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
 
 
 def announced_values(data: Text, at: int) -> int:
-    """Return how many values the list or map at byte *at* announces, two for each key; 0 for other values.
+    """Return the number of values in the list or map whose head is at byte *at*; 0 for any other value.
+
+    A map has two values for each member: the key and the value.  The values themselves are not read.
 
     Raises:
-        BadMessage: *data* ends before.
+        BadMessage: *data* has no byte *at*.
     """
     if at >= len(data):
         raise _cut_off_error()
@@ -354,10 +374,10 @@ def announced_values(data: Text, at: int) -> int:
 
 
 def small_text(data: Text, at: int) -> tuple[str, int]:
-    """Return the text of at most 31 bytes at byte *at*, such as the name of a field, and where it ends.
+    """Return the short MessagePack text at byte *at*, and the index of the byte after it.
 
     Raises:
-        BadMessage: There is something else.
+        BadMessage: The value at *at* is not a text of at most 31 bytes, or *data* has no byte *at*.
     """
     if at >= len(data) or not 0xA0 <= data[at] < 0xC0:
         raise BadMessage("the name of a field is not a short text", hint="send whole messages")
@@ -373,7 +393,10 @@ def _check_containers(depth: int, containers: int, budget: Budget) -> None:
 
 
 def _flat_bytes(data: Text, at: int, count: int) -> int:
-    """Return the size of *count* numbers of one kind at byte *at*; 0 if there is something else."""
+    """Return the size in bytes of *count* values of one fixed-size type, such as float64, at byte *at*.
+
+    Returns 0 if the values there have several types or no fixed size, or *data* is too short.
+    """
     first = data[at]
     step = _STEPS[first]
     if first < 0x80:
@@ -384,7 +407,11 @@ def _flat_bytes(data: Text, at: int, count: int) -> int:
 
 
 def _steps() -> tuple[int, ...]:
-    """Return the distance to the next value by first byte; 0: see `_LENGTHS`; negative: a list or map."""
+    """Return a table by the first byte of a MessagePack value.
+
+    An entry is the size in bytes of the value; 0 if the size follows from a length field (`_LENGTHS`); for a
+    list or map, the negative size of its head.
+    """
     steps = [1] * 256
     steps[0x80:0xA0] = [-1] * 32
     steps[0xA0:0xC0] = [1 + length for length in range(32)]
@@ -399,13 +426,14 @@ def _steps() -> tuple[int, ...]:
     return tuple(steps)
 
 
-# By first byte of bin, ext and str: bytes of the length field, and bytes before the content.
+# By first byte of a bin, ext or str value: the bytes of its length field, and the bytes before its content.
 _LENGTHS = {
     0xC4: (1, 2), 0xC5: (2, 3), 0xC6: (4, 5), 0xC7: (1, 3), 0xC8: (2, 4), 0xC9: (4, 6), 0xD9: (1, 2),
     0xDA: (2, 3), 0xDB: (4, 5),
 }  # fmt: skip
 
 _STEPS = _steps()
+# By first byte of a list or map: the number of values that it counts as, less one.
 _MORE = tuple((MAP_VALUES if k < 0x90 or k >= 0xDE else LIST_VALUES) - 1 for k in range(256))
 
 
@@ -420,7 +448,7 @@ def _too_many_values_error(max_values: int) -> LimitExceeded:
     )
 
 
-# --- JSON -----------------------------------------------------------------------------------------
+# --- checks of JSON ---------------------------------------------------------------------------------
 
 
 def check_json(text: Text, budget: Budget) -> None:
@@ -430,9 +458,9 @@ def check_json(text: Text, budget: Budget) -> None:
 
 
 def check_json_containers(text: Text, budget: Budget) -> None:
-    """Raise LimitExceeded if *text* holds more lists and objects, or levels of them, than *budget* allows.
+    """Raise LimitExceeded if *text* has more lists and objects, or levels of nesting, than *budget* allows.
 
-    Brackets inside strings do not count; a text with many brackets is read once more to exclude them.
+    Brackets inside strings do not count.
     """
     max_depth = budget.depth
     max_lists = budget.containers
@@ -449,9 +477,10 @@ def check_json_containers(text: Text, budget: Budget) -> None:
 
 
 def check_json_counts(text: Text, budget: Budget) -> None:
-    """Raise LimitExceeded if *text* holds more values, long numbers or memory than *budget* allows.
+    """Raise LimitExceeded if *text* holds too many values or long numbers, or would take too much memory.
 
-    Commas, colons and brackets inside strings count, too, unless only they exceed a limit.
+    The text is checked with its strings first, which is faster.  If a limit is exceeded, it is checked again
+    without them, so that commas, colons and brackets inside strings do not count.
     """
     if text.count(b"e") + text.count(b"E") > _MAX_EXTREME_NUMBERS:
         _check_exponents(text)
@@ -465,6 +494,7 @@ def check_json_counts(text: Text, budget: Budget) -> None:
 
 
 def _check_exponents(text: Text) -> None:
+    """Raise LimitExceeded if *text* has more than `_MAX_EXTREME_NUMBERS` with exponents of three digits."""
     numbers = _EXTREME_NUMBER.finditer(text)
     if sum(1 for _ in itertools.islice(numbers, _MAX_EXTREME_NUMBERS + 1)) > _MAX_EXTREME_NUMBERS:
         raise LimitExceeded(
@@ -474,9 +504,10 @@ def _check_exponents(text: Text) -> None:
 
 
 def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_strings: bool) -> None:
-    """Raise LimitExceeded if *text* exceeds a limit by what its *pieces* hold.
+    """Raise LimitExceeded if *text*, which is read in *pieces*, exceeds a limit of *budget*.
 
-    With *has_strings* the pieces still hold the strings, whose length is unknown, so all characters count.
+    With *has_strings* the pieces contain the strings, whose length is therefore unknown: all characters of
+    the text count as characters of strings.
     """
     marks = containers = long_numbers = outside = 0
     for piece in pieces:
@@ -504,12 +535,13 @@ def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_str
 
 
 def _depth(brackets: Text) -> int:
+    """Return the levels of nesting of a text that consists of brackets only."""
     opening = np.isin(np.frombuffer(brackets, np.uint8), np.frombuffer(b"[{", np.uint8))
     return int(np.cumsum(np.where(opening, np.int8(1), np.int8(-1)), dtype=np.int32).max(initial=0))
 
 
 def _without_strings(text: Text, dropped: bytes) -> Iterator[bytes]:
-    """Yield *text* in pieces, without its strings and the bytes *dropped*."""
+    """Yield the JSON *text* in pieces, without its strings and without each byte that is in *dropped*."""
     is_inside = False
     end = 0
     while end < len(text):

@@ -1,8 +1,8 @@
-"""Count the processes that the commands of a robot crashed, and refuse the robot for a while after two.
+"""Count the processes that the commands of each robot crashed, and refuse a robot for a while after two.
 
-A crash counts against the robot whose command caused it, and against no other.  A command that was killed at
-its own deadline does not count: a short deadline is no evidence of harmful bytes.  The caller passes the
-time, and the number of robots that are remembered is bounded.
+A crash counts against the robot whose command caused it, and against no other robot.  A command that was
+killed at its own deadline does not count: a short deadline is no evidence of harmful bytes.  The caller
+passes the time (``now``: monotonic seconds); the number of robots that are remembered is bounded.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from rse_pf.identity import RobotId
 __all__ = ["BLOCK_S", "MAX_CRASHES", "WINDOW_S", "CrashRecord"]
 
 WINDOW_S = 300.0
-"""Two crashes of a robot count together if at most this time lies between them."""
+"""Longest time in seconds between two crashes of a robot that count together."""
 MAX_CRASHES = 2
-"""Crashes after which a robot is refused: one may be an accident."""
+"""Number of crashes after which a robot is refused; a single crash may be an accident."""
 BLOCK_S = 60.0
-"""How long a robot is refused after its last crash, so that it costs at most two processes a minute."""
+"""Seconds for which a robot is refused after its last crash, so that it crashes at most two processes a
+minute."""
 _MAX_ROBOTS = 10_000
-"""Robots whose crashes are remembered; beyond that, the robot whose last crash is oldest is forgotten."""
+"""Most robots whose crashes are remembered; above that, the robot whose last crash is oldest is forgotten."""
 
 
 class CrashRecord:
-    """The crashes that the robots of one server or worker caused; several threads may use it.
+    """The crashes that the robots of one server or worker caused; several threads may call its methods.
 
     A supervisor calls `note_crash` and `blocked`; a worker calls `refusal` before it runs a limited service.
     """
@@ -36,7 +37,7 @@ class CrashRecord:
         self._crashes_s: OrderedDict[RobotId, tuple[float, ...]] = OrderedDict()
 
     def refusal(self, robot: RobotId, now: float) -> Busy | None:
-        """Return why *robot* may not use limited services now, None if it may."""
+        """Return the error with which limited services refuse *robot* now, None if they accept it."""
         with self._lock:
             rest_s = _rest_s(self._crashes_s.get(robot, ()), now)
         if rest_s <= 0:
@@ -49,11 +50,15 @@ class CrashRecord:
         )
 
     def note_crash(self, robot: RobotId, now: float) -> bool:
-        """Count a crash that a command of *robot* caused; return whether the robot is blocked from now on."""
+        """Count a crash that a command of *robot* caused at *now*.
+
+        Returns whether the robot is refused because of this crash.  A crash of a robot that is refused
+        already is not counted.
+        """
         with self._lock:
             crashes = self._crashes_s.pop(robot, ())
             is_first = not crashes or len(crashes) == MAX_CRASHES or now - crashes[0] > WINDOW_S
-            if _rest_s(crashes, now) <= 0:  # otherwise the command was sent before the robot was refused
+            if _rest_s(crashes, now) <= 0:  # otherwise the command came before the robot was refused
                 crashes = (now,) if is_first else (*crashes, now)
             self._crashes_s[robot] = crashes
             if len(self._crashes_s) > _MAX_ROBOTS:
@@ -68,5 +73,5 @@ class CrashRecord:
 
 
 def _rest_s(crashes_s: tuple[float, ...], now: float) -> float:
-    """Return for how long a robot with these crashes is still refused."""
+    """Return the seconds for which a robot with crashes at these times is still refused; at most 0 if not."""
     return crashes_s[-1] + BLOCK_S - now if len(crashes_s) == MAX_CRASHES else 0.0

@@ -2,13 +2,13 @@
 
 This is hierarchical fair queueing by round robin, with two levels:
 
-1. The tenant with the fewest running items is next; of several, the one that has waited longest since it was
-   added, or since one of its items began or ended.
-2. Within that tenant, its robots are chosen by the same rule.
-3. The items of a robot are taken first in, first out.
+1. The tenant with the fewest running items is served next; of several such tenants, the one that has waited
+   longest since it was added, or since one of its items began or ended.
+2. Within that tenant, a robot is chosen by the same rule.
+3. The items of a robot are served first in, first out.
 
-A tenant with many robots, or with slow work, therefore gets no more items running than another tenant whose
-items wait.  Pure: no thread and no clock.
+A tenant with many robots, or with slow work, therefore never runs more items than another tenant whose items
+wait.  This module uses no thread and no clock.
 
 Source:
     Nagle 1987, On packet switches with infinite storage (fair queueing by round robin).
@@ -29,7 +29,10 @@ Item = TypeVar("Item")
 
 
 class FairQueue(Generic[Item]):
-    """Items that wait, and how many of each tenant and robot run."""
+    """The waiting items of all robots, and the numbers of running items of each tenant and each robot.
+
+    Items of a robot or tenant that has as many running items as its maximum wait.
+    """
 
     def __init__(self, *, max_running_per_robot: float = math.inf, max_running_per_tenant: float = math.inf):
         self._max_per_robot = max_running_per_robot
@@ -49,24 +52,25 @@ class FairQueue(Generic[Item]):
                 yield from items
 
     def items_of(self, robot: RobotId) -> deque[Item]:
-        """Return the waiting items of *robot*; the caller may replace one by another."""
+        """Return the waiting items of *robot*, first in first; the caller may replace one by another."""
         robots = self._tenants.get(robot.tenant)
         return deque() if robots is None else robots.get(robot, deque())
 
     def add(self, robot: RobotId, item: Item) -> None:
-        """Let *item* wait behind the other items of *robot*."""
+        """Add *item* behind the other waiting items of *robot*."""
         self._tenants.setdefault(robot.tenant, OrderedDict()).setdefault(robot, deque()).append(item)
         self._count += 1
 
     def peek(self) -> Item | None:
-        """Return the next item without removing it; None if none waits or may run."""
+        """Return the next item without removing it; None if no item waits, or none of those may run."""
         robot = self._next(self._max_per_tenant)
         return None if robot is None else self._tenants[robot.tenant][robot][0]
 
     def take(self, *, only_newcomers: bool = False) -> Item | None:
-        """Remove the next item and return it; it runs until `release`.  None if none waits or may run.
+        """Remove the next item and return it; it counts as running until `release` is called.
 
-        With *only_newcomers* it is of a tenant of which nothing runs.
+        None if no item waits, or none of those may run.  With *only_newcomers*, only items of tenants without
+        a running item may run.
         """
         robot = self._next(1 if only_newcomers else self._max_per_tenant)
         if robot is None:
@@ -82,7 +86,7 @@ class FairQueue(Generic[Item]):
         return item
 
     def release(self, robot: RobotId) -> None:
-        """Note that one running item of *robot* ended; robot and tenant go behind the others that wait."""
+        """Note that a running item of *robot* ended, and put robot and tenant behind the others that wait."""
         for key in (robot, robot.tenant):
             self._running[key] -= 1
             if not self._running[key]:
@@ -94,7 +98,7 @@ class FairQueue(Generic[Item]):
                 robots.move_to_end(robot)
 
     def remove(self, is_gone: Callable[[Item], bool]) -> list[Item]:
-        """Remove the waiting items of which *is_gone* holds, and return them."""
+        """Remove and return the waiting items for which *is_gone* returns True."""
         removed: list[Item] = []
         for robots in list(self._tenants.values()):
             for robot, items in list(robots.items()):
@@ -107,11 +111,11 @@ class FairQueue(Generic[Item]):
         return removed
 
     def position(self, robot: RobotId) -> int:
-        """Return the greatest position, from 1, that one more item of *robot* would have in the queue.
+        """Return the last possible position (1 is next) of one more item of *robot* in the queue.
 
-        Before each of the robot's items at most one of each robot of its tenant is served, and before each of
-        these at most one of each tenant.  This holds if one item runs at a time and no other item arrives; it
-        is an estimate otherwise.
+        Before each item of the robot, at most one item of each other robot of its tenant is served, and
+        before each of these at most one item of each other tenant.  The position is a bound if one item runs
+        at a time and no other item is added; otherwise it is an estimate.
         """
         robots = self._tenants.get(robot.tenant, OrderedDict[RobotId, deque[Item]]())
         rounds = 1 + len(robots.get(robot, ()))
@@ -119,6 +123,7 @@ class FairQueue(Generic[Item]):
         return min(1 + self._count, rounds * (len(robots) + (robot not in robots)) * tenants)
 
     def _next(self, max_per_tenant: float) -> RobotId | None:
+        """Return the robot whose item is next; only tenants with fewer running items than this are served."""
         best, fewest = None, max_per_tenant
         for tenant, robots in self._tenants.items():
             running = self._running[tenant]
@@ -151,16 +156,19 @@ class FairQueue(Generic[Item]):
 def largest_holder(
     held: Mapping[RobotId, int], newcomer: RobotId, may_give: Callable[[RobotId], Any]
 ) -> RobotId | None:
-    """Return the robot that loses one place to *newcomer* when all places are taken; None refuses *newcomer*.
+    """Return the robot that has to give one place to *newcomer* when all places are taken.
 
-    The robot with the most places, within the tenant with the most places, loses one.  It needs two more
-    places than *newcomer*, or its tenant two more than the tenant of *newcomer*; with one more, the two would
-    only swap.
+    It is the robot with the most places within the tenant with the most places.  Only a robot of the same
+    tenant that has at least two more places than *newcomer*, or of another tenant that has at least two more
+    places than the tenant of *newcomer*, has to give one: with one more, the two would only swap.
 
     Args:
         held: Number of places of each robot.
         newcomer: The robot that needs one more place.
-        may_give: Whether a robot can lose a place now.
+        may_give: Returns whether a robot can give a place now.
+
+    Returns:
+        The robot, or None if no robot has to give a place, so that *newcomer* is refused.
     """
     of_tenant: Counter[str] = Counter()
     for robot, count in held.items():

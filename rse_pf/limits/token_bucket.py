@@ -1,4 +1,4 @@
-"""The token bucket that limits every rate: commands, handshakes, recorded refusals, uploads of robots."""
+"""The token bucket, which limits all rates: of commands, handshakes, recorded refusals and uploads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ __all__ = ["TokenBucket"]
 
 @dataclass(slots=True)
 class TokenBucket:
-    """A bucket of *burst* tokens, refilled with *rate* tokens a second; it starts full.
+    """A bucket of at most *burst* tokens, refilled with *rate* tokens a second; it is full at the start.
+
+    ``tokens`` is the number at the time ``at`` of the last refill; it is negative after `spend` took more
+    tokens than there were.  Times are seconds of one clock.
 
     Source:
         Turner 1986, "New directions in communications".
@@ -22,11 +25,11 @@ class TokenBucket:
     at: float = field(init=False, default=-math.inf)
 
     def __post_init__(self) -> None:
-        """Fill the bucket."""
+        """Fill the new bucket."""
         self.tokens = self.burst
 
     def take(self, now: float) -> float:
-        """Take one token at *now* (s) and return 0, or return the seconds until one is available."""
+        """Take one token at *now* (s) and return 0; without a token, return the seconds until there is one."""
         if now > self.at:  # inlined `fill`, because this method runs for each message of each robot
             self.tokens = min(self.burst, self.tokens + (now - self.at) * self.rate)
             self.at = now
@@ -41,7 +44,10 @@ class TokenBucket:
         return 0.0 if self.tokens >= 1.0 else (1.0 - self.tokens) / self.rate
 
     def spend(self, count: float, now: float) -> float:
-        """Take *count* tokens, even more than there are; return the seconds until earlier debt is repaid."""
+        """Take *count* tokens, even if there are fewer; return the seconds to wait.
+
+        The caller waits until the tokens that were taken in excess before this call are refilled; 0 if none.
+        """
         self.fill(now)
         wait_s = max(0.0, -self.tokens) / self.rate
         self.tokens -= count
@@ -53,7 +59,7 @@ class TokenBucket:
         return self.tokens >= self.burst
 
     def fill(self, now: float) -> None:
-        """Add the tokens of the time until *now*."""
+        """Add the tokens for the time from the last refill to *now*; an earlier *now* changes nothing."""
         if now > self.at:
             self.tokens = min(self.burst, self.tokens + (now - self.at) * self.rate)
             self.at = now

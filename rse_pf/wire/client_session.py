@@ -363,7 +363,7 @@ class ClientSession:
         return self._flush(now)
 
     def receive(self, connection: ConnectionState, data: bytes, now: float) -> list[Event]:
-        """Return the events of the WebSocket message *data*; raises ProtocolError if the message is invalid."""
+        """Return the events of the WebSocket message *data*; raises ProtocolError if it is invalid."""
         connection.last_received = now
         message = self.codec.decode_from_server(data)
         match message:

@@ -79,7 +79,7 @@ RENEWAL_PAUSE_S = 1.0
 server a signature check."""
 
 # Close codes of WebSockets that a server sends.
-CLOSE_GOING_AWAY = 1001  # the robot has to leave this server, or was silent for too long
+CLOSE_GOING_AWAY = 1001  # the server stops, or the robot was silent for too long
 CLOSE_PROTOCOL = 4400  # the robot broke the protocol
 CLOSE_TOKEN_OVER = 4401  # the robot's token has expired
 CLOSE_REVOKED = 4403  # the robot or its token was revoked
