@@ -29,7 +29,7 @@ class TokenBucket:
         self.tokens = self.burst
 
     def take(self, now: float) -> float:
-        """Take one token at *now* (s) and return 0; without a token, return the seconds until there is one."""
+        """Take one token at *now* (s) and return 0, or return the seconds until there is one to take."""
         if now > self.at:  # inlined `fill`, because this method runs for each message of each robot
             self.tokens = min(self.burst, self.tokens + (now - self.at) * self.rate)
             self.at = now

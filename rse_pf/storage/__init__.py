@@ -1,4 +1,5 @@
-"""Bytes that outlive a process: files, objects under names, leases, and the quotas of tenants.
+"""Storage that outlives a process: files, objects under names, leases, and the quotas of tenants.
 
-S3 as an object store is in `rse_pf.aws`; what maps and recordings mean is not known here.
+S3 as an object store is in `rse_pf.aws`.  This package does not interpret the maps and recordings that it
+stores.
 """

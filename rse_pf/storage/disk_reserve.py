@@ -1,9 +1,9 @@
 """Reserve disk space with a file, so that an operator can still revoke a robot when the disk is full.
 
-The file has allocated blocks and no content that matters.  When the disk is full, a writer shrinks the file
-by the size of what it writes, then writes as usual: to a temporary file that replaces the old one.  If
-another program takes the blocks first, the writer shrinks the file again.  When too little is left, the
-write fails and the old file stays as it was.
+The file, called the reserve, has allocated blocks, and its content is not used.  When the disk is full, a
+writer shrinks the reserve by the size of the data to write, then writes as usual: to a temporary file that
+replaces the old one.  If another program takes the freed blocks first, the writer shrinks the reserve again.
+When too little of the reserve is left, the write fails and the old file stays as it was.
 """
 
 from __future__ import annotations
@@ -16,26 +16,32 @@ from rse_pf.storage.files import OWNER_ONLY
 
 __all__ = ["RESERVE_BYTES", "DiskReserve", "is_full"]
 
-# Size of a whole reserve beyond that of its files: 256 changes of a short deny list, 128 if others take half.
+# Size in bytes of a full reserve, in addition to the size of the files that it protects: enough for 256
+# changes of a short deny list, or 128 if other programs take half of the freed blocks.
 RESERVE_BYTES = 4 << 20
-# The reserve shrinks by at least this much beyond the content: blocks of the folder and of the lock file.
+# Bytes by which the reserve shrinks in addition to the size of the written file: blocks for the folder and
+# for the lock file.
 _EXTRA_BYTES = 16 << 10
 
 
 def is_full(error: OSError) -> bool:
-    """Return whether *error* says that the disk, or the user's quota on it, is full."""
+    """Return whether *error* means that the disk, or the user's quota on the disk, is full."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 class DiskReserve:
-    """The reserve at one path, on the file system of the files that are to be written."""
+    """The reserve file *path*, which must be on the file system of the files that are to be written."""
 
     def __init__(self, path: Path) -> None:
-        """Describe the reserve; nothing is written."""
+        """Store the path; nothing is written yet."""
         self._path = path
 
     def fill(self, files_bytes: int = 0) -> None:
-        """Make the reserve whole again, for files of *files_bytes*; raises OSError, also on a full disk."""
+        """Enlarge the reserve to its full size: `RESERVE_BYTES` and *files_bytes*, the size of the files.
+
+        Raises:
+            OSError: The file cannot be written, for example because the disk is full.
+        """
         whole = RESERVE_BYTES + files_bytes
         handle = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, OWNER_ONLY)
         try:
@@ -45,7 +51,10 @@ class DiskReserve:
             os.close(handle)
 
     def release(self, size: int) -> bool:
-        """Give the blocks for a file of *size* bytes back to the disk; return False if too few are left."""
+        """Shrink the reserve, so that the disk has free blocks for a file of *size* bytes.
+
+        Returns False, without a change, if the reserve is too small for that or does not exist.
+        """
         try:
             left = self._path.stat().st_size - size - _EXTRA_BYTES
             if left >= 0:

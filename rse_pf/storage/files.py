@@ -1,6 +1,6 @@
-"""Small files that hold state: replaced in one step, and private where they hold a secret.
+"""Read and write small files: files that are replaced in one step, and private files that hold a secret.
 
-A reader of a replaced file sees the old content or the new one, never a part of either.
+A reader of a file that is being replaced gets the old content or the new one, never a mixture.
 """
 
 from __future__ import annotations
@@ -23,21 +23,17 @@ __all__ = [
 ]  # fmt: skip
 
 OWNER_ONLY = 0o600
-"""Mode of a file that holds a secret."""
+"""Mode of a file that holds a secret: only its user may read and write it."""
 TEMPORARY_PREFIX = ".part-"
-"""Prefix of temporary files; a writer that is killed leaves one behind."""
-_BY_UMASK = 0o666  # mode of other files, from which the umask is taken
-_OTHERS = 0o077  # bits of a mode that give permissions to group or others
-_MAX_BYTES = 1 << 20  # of a file with a secret: a longer one is a mistake of its path
-_MAX_DOCUMENT_BYTES = 16 << 20  # of a JSON document that is read as a whole
+"""Prefix of the names of temporary files; a writer that is killed leaves its file behind."""
+_BY_UMASK = 0o666  # mode of a file without a secret, from which the bits of the umask are removed
+_OTHERS = 0o077  # bits of a mode that give permissions to other users
+_MAX_BYTES = 1 << 20  # bytes that are read of a file with a secret: none is longer
+_MAX_DOCUMENT_BYTES = 16 << 20  # bytes of a document that is read as a whole; a longer one is refused
 
 
 def check_exists(path: Path | str, hint: str) -> None:
-    """Refuse a path that does not exist, and name the first folder of it that is missing.
-
-    Raises:
-        UsageError: Neither a file nor a folder is there.
-    """
+    """Raise UsageError with *hint* if nothing exists at *path*; name the first parent that is missing."""
     path = Path(path)
     missing = [each for each in (path, *path.parents) if not each.exists()]
     if missing:
@@ -48,13 +44,16 @@ def check_exists(path: Path | str, hint: str) -> None:
 def replace_file(
     path: Path | str, data: bytes | str, *, mode: int = _BY_UMASK, is_durable: bool = False
 ) -> None:
-    """Replace *path* by a file of *data* in one step, or raise OSError and leave it as it is.
+    """Replace the file *path* by a file with the content *data* in one step, or create it.
 
     Args:
-        path: The file; its folder exists.
+        path: The file; its folder must exist.
         data: The whole content; text is written as UTF-8.
-        mode: Permissions of the new file; the umask is taken off.
-        is_durable: Whether content and name survive a power failure once this returns.
+        mode: Permissions of the new file, without the bits of the umask.
+        is_durable: Whether content and name survive a power failure after this function returned.
+
+    Raises:
+        OSError: The file cannot be written; an existing file is not changed.
     """
     folder = os.path.dirname(path) or "."
     temporary = f"{folder}/{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
@@ -71,21 +70,26 @@ def replace_file(
 
 
 def replace_json(path: Path, value: Any, *, indent: int | None = None) -> None:
-    """Replace *path* by the JSON document of *value* in one step; raises OSError."""
+    """Replace the file *path* by *value* as JSON in one step; raises OSError as `replace_file`."""
     replace_file(path, json.dumps(value, indent=indent))
 
 
 def create_private_file(path: Path, text: str) -> None:
-    """Write *text* durably to a new file that only its owner can read; raises OSError, also if it exists."""
+    """Write *text* to a new file that only this user can read, and sync its content to the disk.
+
+    Raises:
+        OSError: The file cannot be written, or exists already (FileExistsError).
+    """
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY)
     _write(handle, text, True)
 
 
 def read_regular_file(path: Path, max_bytes: int) -> bytes:
-    """Return the content of a file that may come from a stranger.
+    """Return the content of the file *path*, which may come from somebody who is not trusted.
 
     Raises:
-        OSError: It cannot be read, is a pipe or a device, or is longer than *max_bytes*.
+        OSError: The file cannot be read, is no regular file (a pipe or a device), or is longer than
+            *max_bytes*.
     """
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -104,17 +108,17 @@ def read_document(
     parse: Callable[[str], Any] = json.loads,
     max_bytes: int = _MAX_DOCUMENT_BYTES,
 ) -> Any:
-    """Return the value of a file of JSON, TOML or YAML that may come from anybody.
+    """Return the parsed value of a JSON, TOML or YAML file that may come from somebody who is not trusted.
 
     Args:
         path: The file.
-        content: What the file holds, for the error: "a report of a map".
-        hint: What to do if it holds something else.
-        parse: Returns the value of a text, or raises ValueError.
-        max_bytes: Of the file.
+        content: What the file should hold, for the message of the error: "a report of a map".
+        hint: Hint of each error.
+        parse: Returns the value of the text of the file, or raises ValueError.
+        max_bytes: Largest size of the file.
 
     Raises:
-        UsageError: The file cannot be read, is too long, or is not what *parse* takes.
+        UsageError: The file cannot be read, is longer than *max_bytes*, or *parse* refuses its text.
     """
     try:
         return parse(read_regular_file(path, max_bytes).decode())
@@ -125,15 +129,15 @@ def read_document(
 
 
 def read_private_file(path: Path, content: str, *, hint: str) -> bytes:
-    """Return the first MiB of a file that only its owner can read.
+    """Return the content (at most 1 MiB) of a file that only its user may read, because it holds a secret.
 
     Args:
-        path: The file; a pipe or a device reads as empty.
-        content: What the file holds, for the error: "the key".
-        hint: What to do if the file cannot be read.
+        path: The file; for a pipe or a device the result is empty.
+        content: What the file holds, for the message of the error: "the key".
+        hint: Hint of the error if the file cannot be read.
 
     Raises:
-        UsageError: The file cannot be read, or others than its owner can read it, too.
+        UsageError: The file cannot be read, or its mode gives other users a permission.
     """
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
@@ -147,7 +151,7 @@ def read_private_file(path: Path, content: str, *, hint: str) -> bytes:
 
 
 def sync_folder(folder: Path | str) -> None:
-    """Make the names in *folder* survive a power failure."""
+    """Sync *folder* to the disk, so that the names of its files survive a power failure; raises OSError."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(handle)
@@ -156,6 +160,7 @@ def sync_folder(folder: Path | str) -> None:
 
 
 def _write(handle: int, data: bytes | str, is_durable: bool) -> None:
+    """Write *data* to the descriptor *handle*, sync it if *is_durable*, and close it in any case."""
     try:
         view = memoryview(data.encode() if isinstance(data, str) else data)
         while view:

@@ -1,8 +1,9 @@
-"""A lease: one record in a shared store, of which one process at a time is the owner.
+"""A lease: a record in a shared object store, which names the one process that holds the lease.
 
-The record changes by compare-and-swap only, so of two processes that claim it one succeeds.  The
-owner renews it; others watch it with their own clocks, so that the clocks of two machines are never compared.
-Users of this module define the fields of the record, and when another process may claim it.
+The record is changed by compare-and-swap only, so of two processes that claim the lease one succeeds.  The
+holder renews it.  Another process measures with its own clock for how long the record has not changed, so
+that the clocks of two machines are never compared.  The users of this module define the fields of the record,
+and when another process may claim it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ __all__ = ["Lease", "OwnedRecord", "read_record"]
 
 
 def read_record(store: ObjectStore, name: str) -> bytes | None:
-    """Return the record that is stored, None if there is none; raises StoreError."""
+    """Return the bytes of the record *name* in *store*, None if there is none; raises StoreError."""
     try:
         return store.get(name)
     except NotFound:
@@ -27,26 +28,33 @@ def read_record(store: ObjectStore, name: str) -> bytes | None:
 
 
 class OwnedRecord(Protocol):
-    """The fields that every record has: its owner, its state, and the number of its renewals."""
+    """The fields that the record of every lease has."""
 
     @property
     def owner(self) -> str:
-        """Name that is unique to a process and its claim."""
+        """Name of the holder, which is different for each process and each of its claims."""
 
     @property
     def state(self) -> str:
-        """What the owner does, or how it ended."""
+        """What the holder does, or how its work ended."""
 
     @property
     def beat(self) -> int:
-        """Number of renewals."""
+        """Number of renewals by the holder."""
 
 
 R = TypeVar("R", bound=OwnedRecord)
 
 
 class Lease(Generic[R]):
-    """What one process knows of one record, and its writes to it.  Blocking; for one thread at a time."""
+    """One process's copy of the record of a lease, and its writes to this record.
+
+    The methods block, and must not be called by two threads at the same time.
+
+    Attributes:
+        name: Name of the record in the store.
+        record: The record as this process read or wrote it last; None if there was none.
+    """
 
     def __init__(
         self,
@@ -55,17 +63,18 @@ class Lease(Generic[R]):
         decode: Callable[[str, bytes], R],
         clock: Callable[[], float],
     ) -> None:
-        """Read nothing yet.
+        """Create an empty copy; nothing is read yet.
 
         Args:
-            store: Shared by all servers.
-            name: Of the record.
-            decode: Returns the record in bytes that were stored under a name; raises StoreError.
-            clock: Seconds, monotonic.
+            store: The object store that all servers share.
+            name: Name of the record.
+            decode: Takes the name and the stored bytes of a record, and returns the record; raises StoreError
+                if they are damaged.
+            clock: Returns monotonic seconds.
         """
         self.name = name
         self.known: bytes | None = None
-        """As the record was read or written last; None if there was none."""
+        """The bytes of the record as this process read or wrote it last; None if there was none."""
         self.record: R | None = None
         self._store = store
         self._decode = decode
@@ -76,26 +85,33 @@ class Lease(Generic[R]):
 
     @property
     def unchanged_s(self) -> float:
-        """Seconds since this process last noticed a change of the record, by a read, a write or `note_beat`.
+        """Seconds since this process last saw a change of the record, by a read, a write or `note_beat`.
 
-        They also increase while the record is not read.  Before the first change they count from the creation
-        of this object.
+        The value also grows while the record is not read.  Before the first change it is the time since this
+        object was created.
         """
         return self._clock() - self._changed_s
 
     @property
     def age_s(self) -> float:
-        """Seconds since the begin of the last write that succeeded: nobody took the lease before that."""
+        """Seconds since the last successful write of this process began; infinite before the first one.
+
+        At that time no other process had taken the lease.
+        """
         return self._clock() - self._written_s
 
     def read(self) -> R | None:
-        """Read the record; raises StoreError."""
+        """Read the record from the store and return it, None if there is none; raises StoreError."""
         return self.note(read_record(self._store, self.name))
 
     def note(self, stored: bytes | None) -> R | None:
-        """Note what was read from the store.
+        """Note the bytes *stored* that were read from the store (None: no record), and return the record.
 
-        A renewal that the owner has reported by `note_beat` before is no change.
+        A renewal that the holder has reported before, by `note_beat`, does not count as a change for
+        `unchanged_s`.
+
+        Raises:
+            StoreError: The record is damaged.
         """
         if stored == self.known:
             return self.record
@@ -109,18 +125,19 @@ class Lease(Generic[R]):
         return now
 
     def note_beat(self, beat: int) -> None:
-        """Note that the owner itself reported renewal number *beat*."""
+        """Note that the holder reported its renewal number *beat* in another way than by the store."""
         self._reported_beat = max(beat, self._reported_beat)
         self._changed_s = self._clock()
 
     def write(self, record: R) -> bool:
-        """Replace the record that this process knows; return False if the store holds another one.
+        """Replace the stored record by *record*, if it is still the one that this process read or wrote last.
 
-        In that case this process knows the other record afterwards.  A write whose reply was lost succeeded
-        if the store holds its data.
+        Returns whether *record* is stored.  If not, another process has changed the record, and ``record`` is
+        its record.  If the store reports a conflict although it holds *record*, because the reply to an
+        earlier attempt was lost, the write succeeded.
 
         Raises:
-            StoreError: The store fails; nothing is known.
+            StoreError: The store fails; whether *record* is stored is unknown.
         """
         began_s = self._clock()
         data = msgspec.json.encode(record)

@@ -1,7 +1,7 @@
-"""Objects: bytes under a name, in a folder, in memory, and (in `rse_pf.aws`) in S3.
+"""Object stores: bytes under names, in a folder or in memory; the store in S3 is in `rse_pf.aws`.
 
-All stores follow one contract: once `put` returns, the object is complete and durable, whatever crashes
-next.  No name can refer to a file outside the folder of a store.
+After `put` of a folder or of S3 has returned, the object is complete and survives a crash of the machine.  No
+name can refer to a file outside the folder of a store.
 """
 
 from __future__ import annotations
@@ -40,58 +40,60 @@ __all__ = [
     "open_store",
 ]
 
-_Names = list[str]  # within a class that has a method "list"
-_SHARD = "+"  # begins the names of subfolders for the objects of a robot, by the first digits of the digest
+_Names = list[str]  # a name for the type in classes that have a method "list"
+_SHARD = "+"  # begins the name of each subfolder for objects of a robot; two digits of their digests follow
 _LOCK = ".lock-"  # begins the names of lock files
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_WRITE_TRIES = 8
-# A folder that was read sooner than this after its last change may change again without a newer time stamp.
+_WRITE_TRIES = 8  # attempts to write an object whose folder other processes remove at the same time
+# Nanoseconds after the last change of a folder in which it may change again without a newer time stamp, so
+# that its usage is not remembered.
 _UNSETTLED_NS = 100_000_000
-_MAX_MEASURED = 100_000
+_MAX_MEASURED = 100_000  # folders whose usage is remembered; above that, all are forgotten
+# The name of an object: one to ten segments of up to 128 characters, joined by slashes.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectInfo:
-    """Name and size of an object, known without reading it."""
+    """The name of an object and its size in bytes, without its content."""
 
     name: str
     size: int
 
 
 MIN_CHARGE_BYTES = 4096
-"""An object counts for at least this much of a quota: a file takes a block and an inode, however short."""
+"""Bytes of a quota that an object uses at least: even the shortest file takes a block and an inode."""
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What objects count for: their number, and their bytes with `MIN_CHARGE_BYTES` for each at least."""
+    """The number of some objects, and the bytes of a quota that they use together (see `charge_of`)."""
 
     objects: int = 0
     charged_bytes: int = 0
 
     def __add__(self, other: Usage) -> Usage:
-        """Return the sum."""
+        """Return the usage of the objects of both together."""
         return Usage(self.objects + other.objects, self.charged_bytes + other.charged_bytes)
 
 
 class ObjectStore(Protocol):
-    """Bytes by name.  Every method raises only StoreError and its subclasses."""
+    """A store of objects, which are bytes under names.  Its methods raise only subclasses of StoreError."""
 
     def get(self, name: str) -> bytes:
-        """Return the object; raises NotFound."""
+        """Return the bytes of the object *name*; raises NotFound."""
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return at most *length* bytes from *start* on; raises NotFound."""
+        """Return at most *length* bytes of the object from byte *start* on; raises NotFound."""
 
     def put(self, name: str, data: bytes) -> None:
-        """Store the object durably and atomically; raises StoreFull."""
+        """Store *data* as the object *name*, or replace it, durably and in one step; raises StoreFull."""
 
     def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
-        """Store the object durably and atomically; if *pieces* raises an error, nothing is stored."""
+        """Store the joined *pieces* like `put`; if *pieces* raises an error, nothing is stored."""
 
     def head(self, name: str) -> ObjectInfo:
-        """Return size and name; raises NotFound."""
+        """Return name and size of the object without reading it; raises NotFound."""
 
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
         """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
@@ -100,48 +102,55 @@ class ObjectStore(Protocol):
         """Yield, sorted, the names of the folders directly below the folder *prefix*, which ends with /."""
 
     def usage(self, prefix: str) -> Usage:
-        """Return the usage of the objects below the folder *prefix*, which ends with a slash."""
+        """Return the usage of all objects below the folder *prefix*, which ends with a slash."""
 
     def delete(self, name: str) -> None:
-        """Remove the object; a missing one is no error."""
+        """Remove the object *name*; a missing object is no error."""
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected* (None: is missing); raises Conflict."""
+        """Replace the object by *data* if its content is *expected*; None means that it must be missing.
+
+        Raises:
+            Conflict: The object has another content, or exists; it is not changed.
+        """
 
 
 @runtime_checkable
 class PresigningStore(Protocol):
-    """A store that can sign URLs for one object and a limited time, without any request: a bucket of S3."""
+    """A store that can sign URLs for one object and a limited time, without a request: a bucket of S3."""
 
     def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
-        """Return a URL and the headers with which exactly these bytes can be PUT."""
+        """Return a URL, and headers with which a client can PUT the object *name* there for *ttl_s* seconds.
+
+        Only bytes of this *size* and *sha256* (hex) are accepted.
+        """
 
     def presigned_get(self, name: str, *, ttl_s: int) -> str:
-        """Return a URL from which the object can be read."""
+        """Return a URL from which a client can read the object *name* for *ttl_s* seconds."""
 
 
 def charge_of(size: int) -> int:
-    """Return how many bytes of a quota an object of *size* bytes uses."""
+    """Return how many bytes of a quota an object of *size* bytes uses: at least `MIN_CHARGE_BYTES`."""
     return max(size, MIN_CHARGE_BYTES)
 
 
 def usage_of(listed: Iterable[ObjectInfo]) -> Usage:
-    """Return the usage of the objects in a list."""
+    """Return the usage of the objects in *listed* together."""
     return sum((Usage(1, charge_of(info.size)) for info in listed), Usage())
 
 
 def digest_of(data: bytes) -> str:
-    """Return the sha256 of *data* in hex: the name of an immutable object."""
+    """Return the sha256 of *data* in hex, which is the name of an immutable object with this content."""
     return hashlib.sha256(data).hexdigest()
 
 
 def is_name(name: str) -> bool:
-    """Return whether *name* consists of at most ten plain path segments."""
+    """Return whether *name* is valid: one to ten segments of letters, digits and ``. _ = -``, joined by /."""
     return _NAME.fullmatch(name) is not None
 
 
 def check_name(name: str) -> str:
-    """Return *name*; raises StoreError unless it consists of at most ten plain path segments."""
+    """Return *name*; raises StoreError if it is not valid by `is_name`."""
     if not is_name(name):
         raise StoreError(
             f"{name[:80]!r} is not a name of an object",
@@ -153,9 +162,15 @@ def check_name(name: str) -> str:
 def open_store(
     location: str, openers: Mapping[str, Callable[[str], ObjectStore]] | None = None
 ) -> ObjectStore:
-    """Return the store at ``dir:PATH``, ``memory:``, or what *openers* know by kind, as ``s3:BUCKET``.
+    """Return the store at *location*: ``dir:PATH``, ``memory:``, or ``KIND:PLACE`` with a kind in *openers*.
 
-    For S3 pass ``{"s3": lambda bucket: open_bucket(bucket, region)}`` with `open_bucket` of `rse_pf.aws`.
+    Args:
+        location: The store, as in the setting ``data.store``.
+        openers: By kind, a function from the place to the store.  For ``s3:BUCKET`` pass
+            ``{"s3": lambda bucket: open_bucket(bucket, region)}`` with `open_bucket` of `rse_pf.aws`.
+
+    Raises:
+        UsageError: *location* is malformed, or has an unknown kind.
     """
     kind, _, place = location.partition(":")
     if kind == "memory":
@@ -168,7 +183,7 @@ def open_store(
 
 
 class MemoryStore:
-    """Objects in the memory of one process."""
+    """An `ObjectStore` in the memory of one process; its objects are lost when the process exits."""
 
     def __init__(self) -> None:
         self._objects: dict[str, bytes] = {}
@@ -233,14 +248,14 @@ class MemoryStore:
 
 
 class DirectoryStore:
-    """Objects as files below one folder, written by temporary file, fsync and rename.
+    """An `ObjectStore` of files below one folder, written by temporary file, fsync and rename.
 
-    A robot's objects lie in up to 256 folders by the first two digits of their digests, as
-    ``objects/TENANT/ROBOT/+ab/DIGEST``, so that a page of a list reads a few small folders.
+    The objects of a robot are in up to 256 folders by the first two digits of their digests, as
+    ``objects/TENANT/ROBOT/+ab/DIGEST``, so that each page of a listing reads a few small folders only.
     """
 
     def __init__(self, folder: Path, reserve: DiskReserve | None = None) -> None:
-        """Describe the store; on a full disk `compare_and_swap` takes space from *reserve*."""
+        """Store the folder, and create nothing; on a full disk `compare_and_swap` uses space of *reserve*."""
         self._folder, self._root = folder, str(folder)
         self._reserve = reserve
         self._measured: dict[str, tuple[int, Usage, _Names]] = {}
@@ -251,7 +266,11 @@ class DirectoryStore:
             return file.read()
 
     def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
-        """Return size and a part of the object if these bytes are in memory."""
+        """Return the size of the object and at most *length* of its bytes from *start* on, without a wait.
+
+        None if the object is missing, or these bytes are not in the page cache, so that a read would wait for
+        the disk.
+        """
         return _read_cached(self._path(name), start, length)
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
@@ -268,14 +287,15 @@ class DirectoryStore:
         self._write(name, lambda path: _replace_by_pieces(path, pieces))
 
     def append(self, name: str, offset: int, data: bytes) -> None:
-        """Add *data* to the object of *offset* bytes, which is missing if that is 0.
+        """Append *data* to the object *name*, whose present size must be *offset*; 0 creates it if missing.
 
-        The object survives this process, but a crash of the machine may damage it.  A lock on its file
-        excludes other writers.
+        The data survive the end of this process, but a crash of the machine may damage them.  A lock on the
+        file excludes other writers.
 
         Raises:
+            NotFound: *offset* is above 0, and the object is missing.
             Conflict: The object has another size.
-            Busy: Another process writes it.
+            Busy: Another process writes to the object.
         """
 
         def add(path: str) -> None:
@@ -292,12 +312,12 @@ class DirectoryStore:
         self._write(name, add)
 
     def adopt(self, name: str, source: str, size: int) -> None:
-        """Give the object *source* the name *name*, durably.
+        """Rename the object *source* to *name* durably, if it has *size* bytes.
 
         Raises:
-            NotFound: It is missing.
-            Conflict: It does not have *size* bytes.
-            Busy: Another process writes it.
+            NotFound: *source* is missing.
+            Conflict: *source* has another size.
+            Busy: Another process writes to *source*.
         """
         grown = self._path(source)
 
@@ -318,9 +338,9 @@ class DirectoryStore:
         return ObjectInfo(name=name, size=status.st_size)
 
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
-        """Yield the objects whose names begin with *prefix* and are greater than *after*.
+        """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name.
 
-        Only the folders that the caller's iteration reaches are read.
+        A folder is read only when the iteration reaches it.
         """
         above, slash, _ = prefix.rpartition("/")
         if not slash or is_name(above):
@@ -331,7 +351,7 @@ class DirectoryStore:
         yield from sorted(name for name in self._scan(prefix)[1] if is_name(name))
 
     def usage(self, prefix: str) -> Usage:
-        """Return the usage of the objects below *prefix*; only folders that changed are read again."""
+        """Return the usage of all objects below *prefix*; only folders that have changed are read again."""
         place = f"{self._folder}/{prefix}"
         with _as_store_errors(prefix):
             try:
@@ -351,7 +371,7 @@ class DirectoryStore:
         return total
 
     def space(self) -> tuple[int, int]:
-        """Return the free bytes of the disk, and its size."""
+        """Return the free bytes and the size in bytes of the file system of the folder."""
         folder = self._folder
         while True:
             with _as_store_errors(str(self._folder)), contextlib.suppress(FileNotFoundError):
@@ -360,7 +380,7 @@ class DirectoryStore:
             folder = folder.parent
 
     def delete(self, name: str) -> None:
-        """Remove the object, and its folder if nothing else lies there; a missing one is no error."""
+        """Remove the object, and its folder if that is empty then; a missing object is no error."""
         path = self._path(name)
         folder, lock = os.path.dirname(path), _lock_of(path)
         with contextlib.suppress(NotFound), _as_store_errors(name):
@@ -374,7 +394,7 @@ class DirectoryStore:
                     os.rmdir(folder)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected*; a lock file excludes other writers."""
+        """Replace the object if its content is *expected*; a lock file excludes other writers."""
 
         def check() -> None:
             try:
@@ -388,7 +408,8 @@ class DirectoryStore:
             check()
             lock = _lock_of(path)
             while True:
-                # Written before it is locked: a process that is paused hardly ever holds the lock then.
+                # The data are written before the lock is taken, so that a process that is paused while it
+                # writes does not hold the lock.
                 try:
                     with _temporary(path, [data]) as temporary, _hold_lock(lock):
                         check()
@@ -402,7 +423,12 @@ class DirectoryStore:
         self._write(name, swap)
 
     def sweep(self, *, now: float, older_than_s: float) -> int:
-        """Remove the temporary files of writers that crashed and return their number; *now* is Unix time."""
+        """Remove the temporary files that crashed writers left, and return the number of removed files.
+
+        Args:
+            now: Unix seconds.
+            older_than_s: Age in seconds above which a file is removed: no writer uses it any more.
+        """
         removed = 0
         for at, _, names in os.walk(self._folder):
             for path in (Path(at, name) for name in names if name.startswith(TEMPORARY_PREFIX)):
@@ -413,13 +439,17 @@ class DirectoryStore:
         return removed
 
     def _path(self, name: str) -> str:
+        """Return the path of the file of the object *name*; raises StoreError for an invalid name."""
         path = f"{self._root}/{check_name(name)}"
         folder, _, last = path.rpartition("/")
         is_of_robot = name.startswith("objects/") and _DIGEST.fullmatch(last) is not None
         return f"{folder}/{_SHARD}{last[:2]}/{last}" if is_of_robot else path
 
     def _write(self, name: str, write: Callable[[str], None]) -> None:
-        """Call *write* for the path of the object; again if there was no folder, which is made first."""
+        """Call *write* with the path of the object; if its folder is missing, create the folder and repeat.
+
+        Errors of the file system become errors of the store.
+        """
         path = self._path(name)
         changed: list[str] = []
         with _as_store_errors(name):
@@ -432,12 +462,12 @@ class DirectoryStore:
                     changed += _make_folder(os.path.dirname(path))
                 else:
                     break
-            # Last, because what was written is then in the same commit of the file system's journal.
+            # The folders are synced last, so that the file system's journal commits them with the file.
             for folder in reversed(changed):
                 sync_folder(folder)
 
     def _measure(self, prefix: str) -> tuple[Usage, _Names]:
-        """Return the usage of the objects in the folder *prefix* itself, and the folders in it."""
+        """Return the usage of the objects directly in the folder *prefix*, and the names of its folders."""
         objects = charged = 0
         files, folders = self._scan(prefix)
         for name in files:
@@ -448,7 +478,10 @@ class DirectoryStore:
         return Usage(objects, charged), folders
 
     def _scan(self, at: str) -> tuple[_Names, _Names]:
-        """Return the names of the files and of the folders in the folder *at*, which is "" or ends with /."""
+        """Return the names of the files and of the folders in the folder *at*, which is "" or ends with /.
+
+        Both lists are empty if there is no such folder.
+        """
         files, folders = [], []
         with (
             _as_store_errors(at), contextlib.suppress(FileNotFoundError, NotADirectoryError),
@@ -462,10 +495,13 @@ class DirectoryStore:
         return files, folders
 
     def _walk(self, place: str, at: str, prefix: str, after: str) -> Iterator[ObjectInfo]:
-        """Yield the objects in the folder *place*, whose names begin with *at*, in the order of names."""
+        """Yield the objects in the folder *place* and below, sorted by name, that fit *prefix* and *after*.
+
+        *at* is the beginning of their names: *place* without folders that begin with `_SHARD`.
+        """
         files, folders = self._scan(place)
         rows = [(name, name) for name in files]
-        # The names in the folder +ab begin with ab, so it sorts where ab does.
+        # The names of the objects in the folder +ab begin with ab, so this folder is sorted as ab.
         rows += [(name[1:] if name.startswith(_SHARD) else f"{name}/", f"{name}/") for name in folders]
         for begin, entry in sorted(rows):
             name = at + begin
@@ -485,9 +521,10 @@ def _open(path: str) -> BinaryIO:
 
 
 def _read_cached(path: str, start: int, length: int) -> tuple[int, bytes] | None:
-    """Return the size of the file at *path*, which is no link, and at most *length* bytes from *start* on.
+    """Return the size of the file *path*, and at most *length* of its bytes from *start* on.
 
-    None if it may be absent or these bytes are not in memory, so that reading them would wait for the disk.
+    None if there is no such regular file, or these bytes are not in the page cache, so that reading them
+    would wait for the disk.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -500,7 +537,7 @@ def _read_cached(path: str, start: int, length: int) -> tuple[int, bytes] | None
         data = bytearray(max(0, min(length, status.st_size - start)))
         got = os.preadv(descriptor, [data], start, os.RWF_NOWAIT) if data else 0
         return (status.st_size, bytes(data)) if got == len(data) else None
-    except OSError:  # a part is not in memory, or the file system does not know
+    except OSError:  # a part is not in the page cache, or the file system does not support the request
         return None
     finally:
         os.close(descriptor)
@@ -512,7 +549,7 @@ def _lock_of(path: str) -> str:
 
 
 def _make_folder(folder: str) -> list[str]:
-    """Create *folder* and its missing parents; return the folders that the caller has to sync for that."""
+    """Create *folder* and its missing parents; return the parents of all of these, for the caller to sync."""
     missing = []
     while not os.path.isdir(folder):
         missing.append(folder)
@@ -521,7 +558,7 @@ def _make_folder(folder: str) -> list[str]:
         try:
             os.mkdir(made)
         except FileNotFoundError:
-            break  # a remover took its parent meanwhile: the caller tries again
+            break  # another process removed the parent meanwhile: the caller tries again
         except FileExistsError as error:
             if _is_no_folder(made):
                 raise StoreError(
@@ -531,7 +568,7 @@ def _make_folder(folder: str) -> list[str]:
 
 
 def _is_no_folder(path: str) -> bool:
-    """Return whether something else than a folder is at *path*; False if a remover took it meanwhile."""
+    """Return whether something that is not a folder is at *path*; False if nothing is there any more."""
     try:
         return not stat.S_ISDIR(os.stat(path).st_mode)
     except FileNotFoundError:
@@ -540,7 +577,12 @@ def _is_no_folder(path: str) -> bool:
 
 @contextlib.contextmanager
 def _locked(path: str, flags: int, size: int) -> Iterator[int]:
-    """Yield a descriptor of the file *path*, locked; raises Conflict unless it has *size* bytes."""
+    """Open the file *path* with *flags*, lock it, and yield its descriptor.
+
+    Raises:
+        Conflict: The file does not have *size* bytes, or was replaced meanwhile.
+        Busy: Another process holds the lock.
+    """
     handle = os.open(path, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, OWNER_ONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -561,7 +603,10 @@ def _replace_by_pieces(path: str, pieces: Iterator[bytes]) -> None:
 
 @contextlib.contextmanager
 def _temporary(path: str, pieces: Iterable[bytes]) -> Iterator[str]:
-    """Write a file beside *path* durably; it is removed if the caller raises an error."""
+    """Write *pieces* durably to a temporary file in the folder of *path*, and yield its path.
+
+    The file is removed if writing fails or the caller raises an error.
+    """
     temporary = f"{os.path.dirname(path)}/{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, OWNER_ONLY)
     try:
@@ -579,16 +624,20 @@ def _temporary(path: str, pieces: Iterable[bytes]) -> Iterator[str]:
 
 @contextlib.contextmanager
 def _hold_lock(path: str) -> Iterator[None]:
-    """Hold the lock file *path*, which its holder may remove."""
+    """Hold a lock on the lock file *path* while the body runs; wait until no other process holds it.
+
+    The body may remove the lock file.
+    """
     while True:
         with open(path, "wb") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            if _is_at(path, file.fileno()):  # else it was removed while this writer waited
+            if _is_at(path, file.fileno()):  # otherwise the file was removed while this process waited
                 yield
                 return
 
 
 def _is_at(path: str, handle: int) -> bool:
+    """Return whether the open file *handle* is the file that is at *path* now."""
     try:
         return os.path.samestat(os.fstat(handle), os.lstat(path))
     except FileNotFoundError:
@@ -597,6 +646,7 @@ def _is_at(path: str, handle: int) -> bool:
 
 @contextlib.contextmanager
 def _as_store_errors(name: str) -> Iterator[None]:
+    """Convert each OSError of the body to a StoreError about the object *name*."""
     try:
         yield
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:

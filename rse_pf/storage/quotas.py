@@ -1,27 +1,30 @@
-"""Limit the bytes that robots and tenants store: the one account of storage, for all servers.
+"""Limit the bytes that robots and tenants store, in one account for all servers.
 
-What counts:
+What is charged:
 
-- for a robot: its objects, its unfinished uploads, and the versions of maps that it committed
-- for its tenant: all of these, and what no single robot owns, which is all versions of maps, the logs,
-  snapshots and features of live maps, the states of services, and waiting jobs
+- to a robot: its objects, its unfinished uploads, and the versions of maps that it committed
+- to its tenant: all objects and unfinished uploads of its robots, all versions of maps, the logs, snapshots
+  and features of live maps, the states of services, and waiting jobs
 
-Bytes are reserved before they are written.  Nothing is removed to make something fit; reading and removing
+Bytes are reserved before they are written.  Nothing is removed to make other data fit; reading and removing
 are never refused.
 
-How it is counted:
+How the bytes are counted:
 
-1. ``accounts/TENANT`` in the store holds the bytes that were counted last, and those granted since then.  It
-   changes by compare-and-swap, so it holds for all processes.
-2. A process draws a few MiB of a tenant at a time, and spends them from memory.
-3. The bytes of a robot are counted by each process for itself.  It counts again what other processes stored:
-   every `_RECOUNT_S` in a folder (reading only what changed), every `_SLOW_RECOUNT_S` in other stores.
-4. ``quotas/TENANT`` holds the quota that an operator gave to one tenant; without it the setting applies.
-5. ``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` is an empty object that counts one version of a map, of SIZE
-   bytes, for the robot that committed it.  Versions of live maps have none: no robot commits them.
+1. The object ``accounts/TENANT`` holds the bytes of the tenant that were counted last, and the bytes that
+   were granted to processes since then.  It is changed by compare-and-swap, so it is valid for all processes.
+2. A process draws a few MiB from this account at a time, and charges new objects to them in its memory.
+3. Each process counts the bytes of a robot for itself.  To include what other processes stored, it counts
+   again: every `_RECOUNT_S` in a folder (only folders that changed are read), every `_SLOW_RECOUNT_S` in
+   other stores.
+4. The object ``quotas/TENANT`` holds the quota that an operator gave to one tenant; without this object the
+   setting ``data.tenant_quota_bytes`` applies.
+5. ``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` is an empty object, by which one version of a map, of SIZE bytes,
+   is charged to the robot that committed it.  Versions of live maps have none: no robot commits them.
 
-While the disk has little free space, a tenant may hold at most its share: the bytes of all tenants and the
-free bytes, divided by the number of tenants.  A tenant that fills the disk is refused, and others go on.
+While the disk has little free space, a tenant may store at most an equal part: the bytes of all tenants and
+the free bytes together, divided by the number of tenants.  So a tenant that fills the disk is refused, while
+others can still store data.
 """
 
 from __future__ import annotations
@@ -54,25 +57,32 @@ __all__ = [
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")
-_RECOUNT_S = 10.0  # between two counts of a folder, which reads only what changed
-_SLOW_RECOUNT_S = 600.0  # between two counts of another store, which lists all objects
+_RECOUNT_S = 10.0  # seconds between two counts of a folder, of which only changed subfolders are read
+_SLOW_RECOUNT_S = 600.0  # seconds between two counts of another store, for which all objects are listed
 _REFUSED_RECOUNT_SHARE = 0.1
-"""Share of the usual time after which a tenant is counted again before a refusal: it may have deleted."""
-_MAX_ACCOUNTS = 10_000  # robots, and tenants, that a process remembers; others are counted anew
-_MAX_DRAWN_BYTES = 16 << 20  # most bytes that a process draws from an account at once
-_DRAWN_DIVISOR = 64  # a process draws 1/64 of what is left, so that several can share a nearly full account
-_DRAWN_S = 5.0  # drawn bytes expire after this time, so that a process that exited holds none for long
-_WRITTEN_S = 15.0  # an object is written at most this long after its bytes were drawn
+"""Fraction of these times after which a tenant is counted again before it is refused, because it may have
+deleted objects."""
+_MAX_ACCOUNTS = 10_000  # most robots, and most tenants, whose counts a process remembers
+_MAX_DRAWN_BYTES = 16 << 20  # most bytes that a process draws from the account of a tenant at once
+_DRAWN_DIVISOR = 64  # a process draws 1/64 of the bytes left, so that several can use a nearly full account
+_DRAWN_S = 5.0  # seconds after which drawn bytes expire, so that a process that exited holds none for long
+_WRITTEN_S = 15.0  # longest time in seconds from the drawing of an object's bytes to the end of its writing
 _MAX_SWAPS = 50  # attempts to change an account that other processes change at the same time
-_DISK_SHARE_S = 1.0  # how long the share of a nearly full disk is remembered: counting reads all tenants
+_DISK_SHARE_S = (
+    1.0  # seconds for which an equal part of the disk is remembered: all tenants are counted for it
+)
 _RESERVE_SHARE = 0.1
-"""Share of the disk below which a tenant that holds more than its share is refused."""
+"""Free fraction of the disk below which a tenant that stores more than an equal part is refused."""
 _NEVER = float("-inf")
 _OF_TENANT = ("objects", "maps", "live", "states", "jobs")
+"""First segments of the names of objects that are charged to the tenant in the second segment."""
 
 
 class _Ledger(msgspec.Struct, frozen=True, array_like=True):
-    """``accounts/TENANT``: the bytes at Unix time *counted_s*, and ``(time, bytes)`` of grants since then."""
+    """The object ``accounts/TENANT``: the bytes that were counted at the Unix time *counted_s*.
+
+    *granted* are the Unix time and the bytes of each grant to a process since then.
+    """
 
     counted_s: float
     charged_bytes: int
@@ -80,6 +90,7 @@ class _Ledger(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def used_bytes(self) -> int:
+        """The counted bytes and all granted bytes."""
         return self.charged_bytes + sum(size for _, size in self.granted)
 
 
@@ -88,7 +99,7 @@ _decode = msgspec.json.Decoder(_Ledger).decode
 
 
 class TenantAccount:
-    """The bytes of one tenant, as one process charges them.  Blocking; used by several threads."""
+    """The account of one tenant in one process.  Its methods block; several threads may call them."""
 
     def __init__(
         self,
@@ -99,14 +110,14 @@ class TenantAccount:
         wall_clock: Callable[[], float] = time.time,
         check: Callable[[], None] = lambda: None,
     ) -> None:
-        """Count nothing yet.
+        """Create the account; nothing is counted yet.
 
         Args:
             store: The store that all processes share.
-            tenant: The name of the tenant.
-            settings: The quota of the tenant, and the reserve of the disk.
-            wall_clock: The clock, Unix seconds.
-            check: Called between two reads; ends the work by the error that it raises.
+            tenant: Name of the tenant.
+            settings: Hold the quota of tenants that have no quota of their own.
+            wall_clock: Returns Unix seconds.
+            check: Called between two reads of the store; an error that it raises ends the count.
         """
         self._store, self._settings, self._wall_clock, self._check = store, settings, wall_clock, check
         self._tenant, self._folder = tenant, name_segment(tenant)
@@ -117,12 +128,18 @@ class TenantAccount:
         self._share_bytes, self._share_s = 0.0, _NEVER
 
     def quota_bytes(self) -> int:
-        """Return what the tenant may store, which an operator may change at any time; raises StoreError."""
+        """Return how many bytes the tenant may store now; raises StoreError.
+
+        It is the tenant's own quota, which an operator may change at any time, or the setting.
+        """
         own = own_quota_bytes(self._store, self._folder)
         return self._settings.tenant_quota_bytes if own is None else own
 
     def try_charge(self, size: int) -> bool:
-        """Charge an object of *size* bytes unless that needs the store; return whether it was charged."""
+        """Charge an object of *size* bytes to the drawn bytes, if that needs neither the store nor a wait.
+
+        Returns whether the object was charged; if not, call `reserve`.
+        """
         charge = charge_of(size)
         if not self._lock.acquire(blocking=False):
             return False
@@ -132,16 +149,17 @@ class TenantAccount:
             self._lock.release()
 
     def reserve(self, size: int, *, margin: int = 0, freed: int = 0) -> None:
-        """Charge an object of *size* bytes, which is written now.
+        """Charge an object of *size* bytes, which the caller writes now.
 
         Args:
-            size: Of the object.
-            margin: Bytes that must stay free in addition, for what is written later because of the object.
+            size: Size of the object.
+            margin: Bytes that must stay free in addition, for data that will be written because of it.
             freed: Bytes that are removed when the object is written.
 
         Raises:
             QuotaExceeded: The tenant would store more than its own quota, or ``data.tenant_quota_bytes``.
-            StoreFull: The disk is nearly full, and the tenant holds more than its share of it.
+            StoreFull: The disk is nearly full, and the tenant would store more than an equal part of it.
+            Busy: Other processes changed the account at each of `_MAX_SWAPS` attempts.
             StoreError: The store fails.
         """
         charge = charge_of(size)
@@ -152,25 +170,33 @@ class TenantAccount:
                 self._drawn_s = self._wall_clock()
 
     def release(self, size: int) -> None:
-        """Charge *size* bytes less: an object was removed, or was not written."""
+        """Take back the charge for an object of *size* bytes, which was removed or not written.
+
+        The bytes are added to the drawn ones; if those have expired, the next count of the tenant finds them.
+        """
         with self._lock:
             if self._is_drawn():
                 self._drawn_bytes += charge_of(size)
 
     def _is_drawn(self) -> bool:
+        """Return whether the drawn bytes have not expired; if they have, forget them."""
         is_drawn = 0.0 <= self._wall_clock() - self._drawn_s < _DRAWN_S
         if not is_drawn:
             self._drawn_bytes = 0
         return is_drawn
 
     def _spend_drawn(self, charge: int) -> bool:
+        """Subtract *charge* from the drawn bytes, if there are as many; return whether there were."""
         if not self._is_drawn() or self._drawn_bytes < charge:
             return False
         self._drawn_bytes -= charge
         return True
 
     def _draw(self, charge: int, margin: int) -> int:
-        """Grant *charge* bytes and some more to this process; return how many."""
+        """Draw *charge* bytes and some more from the account for this process; return how many.
+
+        Raises as `reserve`.
+        """
         for _ in range(_MAX_SWAPS):
             known = self._read()
             now = self._wall_clock()
@@ -182,7 +208,7 @@ class TenantAccount:
                 ledger = self._recount(ledger)
                 refused = self._refusal(ledger, charge, margin)
             if refused is not None:
-                with contextlib.suppress(StoreError):  # what was counted saves others the same work
+                with contextlib.suppress(StoreError):  # the stored count saves other processes the same work
                     if ledger != _ledger(known):
                         self._store.compare_and_swap(self._name, known, _encode(ledger))
                 raise refused
@@ -202,13 +228,14 @@ class TenantAccount:
             return None
 
     def _recount(self, before: _Ledger | None) -> _Ledger:
-        """Count what lies in the store; grants that may not be written yet stay."""
+        """Count the bytes in the store; keep the grants whose objects may not have been written yet."""
         begun_s = self._wall_clock()
         charged = stored_by_tenant(self._store, self._folder, self._check).charged_bytes
         granted = () if before is None else before.granted
         return _Ledger(begun_s, charged, tuple(grant for grant in granted if grant[0] > begun_s - _WRITTEN_S))
 
     def _refusal(self, ledger: _Ledger, charge: int, margin: int) -> QuotaExceeded | StoreFull | None:
+        """Return the error if *charge* bytes, with *margin* bytes left free, do not fit; None if they do."""
         used, own = ledger.used_bytes, own_quota_bytes(self._store, self._folder)
         most, name = self._settings.tenant_quota_bytes, "data.tenant_quota_bytes"
         if own is not None:
@@ -233,14 +260,17 @@ class TenantAccount:
         )
 
     def _free_bytes(self) -> float:
-        """Return how many bytes are free above the reserve of the disk."""
+        """Return how many bytes of the disk are free above `_RESERVE_SHARE`; infinite for other stores."""
         if not isinstance(self._store, DirectoryStore):
             return float("inf")
         free, total = self._store.space()
         return free - int(total * _RESERVE_SHARE)
 
     def _share(self) -> float:
-        """Return how many bytes a tenant may hold while the disk is nearly full."""
+        """Return how many bytes a tenant may store while the disk is nearly full; infinite for other stores.
+
+        The disk is divided by at least two, so that a single tenant cannot fill it.
+        """
         if not isinstance(self._store, DirectoryStore):
             return float("inf")
         now = self._wall_clock()
@@ -253,14 +283,17 @@ class TenantAccount:
 
 
 def _ledger(data: bytes | None) -> _Ledger | None:
-    """Return the ledger in *data*; None without data and for damaged data, so that all is counted."""
+    """Return the ledger in *data*; None without data and for damaged data, so that the caller counts."""
     with contextlib.suppress(msgspec.MsgspecError):
         return None if data is None else _decode(data)
     return None
 
 
 def _with_grant(ledger: _Ledger, now: float, size: int) -> _Ledger:
-    """Return *ledger* with a grant; grants of the same 10 s are one, as if made at their end."""
+    """Return *ledger* with a grant of *size* bytes at *now*.
+
+    The grants of each period of `_RECOUNT_S` are added to one grant with the time of the period's end.
+    """
     at = now // _RECOUNT_S * _RECOUNT_S + _RECOUNT_S
     before = ledger.granted
     if before and before[-1][0] == at:
@@ -269,10 +302,12 @@ def _with_grant(ledger: _Ledger, now: float, size: int) -> _Ledger:
 
 
 def own_quota_bytes(store: ObjectStore, folder: str) -> int | None:
-    """Return the quota that an operator gave to the tenant with this folder; None if the setting applies.
+    """Return the quota in bytes that an operator gave to the tenant; None if the setting applies.
+
+    *folder* is `rse_pf.identity.name_segment` of the tenant's name.
 
     Raises:
-        StoreError: The store fails, or the quota is damaged.
+        StoreError: The store fails, or the stored quota is damaged.
     """
     try:
         return int(store.get(_quota_name(folder)))
@@ -283,9 +318,9 @@ def own_quota_bytes(store: ObjectStore, folder: str) -> int | None:
 
 
 def set_own_quota(store: ObjectStore, folder: str, quota_bytes: int | None) -> None:
-    """Give a tenant a quota of its own; None means ``data.tenant_quota_bytes``.
+    """Give the tenant with this *folder* a quota of its own; None removes it, so that the setting applies.
 
-    Processes see it when they draw bytes next, at most `_DRAWN_S` later.
+    The other processes use the new quota when they draw bytes next, at most `_DRAWN_S` seconds later.
     """
     if quota_bytes is None:
         store.delete(_quota_name(folder))
@@ -298,12 +333,15 @@ def _quota_name(folder: str) -> str:
 
 
 def tenant_folders(store: ObjectStore) -> set[str]:
-    """Return the folders of all tenants that store anything."""
+    """Return the folders of all tenants that have stored anything: the segments of their names."""
     return {folder for area in _OF_TENANT for folder in store.folders(f"{area}/")}
 
 
 def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] = lambda: None) -> Usage:
-    """Return the usage that the tenant with this folder is charged with."""
+    """Count and return the usage that is charged to the tenant with this *folder*.
+
+    *check* is called between two reads of the store; an error that it raises ends the count.
+    """
     total = Usage()
     for area in _OF_TENANT:
         check()
@@ -314,7 +352,10 @@ def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] 
 
 
 def _uploads(store: ObjectStore, folder: str, check: Callable[[], None]) -> Usage:
-    """Return the usage of the unfinished uploads of a robot, counted with their final sizes."""
+    """Return the usage of the unfinished uploads of a robot, each with its final size.
+
+    *folder* is that of the robot, and ends with a slash.
+    """
     total = Usage()
     for upload in store.folders(f"uploads/{folder}"):
         check()
@@ -324,7 +365,7 @@ def _uploads(store: ObjectStore, folder: str, check: Callable[[], None]) -> Usag
 
 
 def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
-    """Return the name of the object that counts a version of a map for *robot*.
+    """Return the name of the empty object by which a version of a map is charged to *robot*.
 
     Args:
         robot: The robot that committed the version.
@@ -336,12 +377,12 @@ def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
 
 
 def sum_charges(store: ObjectStore, robot: RobotId, check: Callable[[], None] = lambda: None) -> Usage:
-    """Return the number and the charged bytes of all versions of maps that count for *robot*.
+    """Return the number and the bytes of all versions of maps that are charged to *robot*.
 
     Args:
         store: The store of the maps.
         robot: The robot.
-        check: Called before each object; an error that it raises stops the work.
+        check: Called for each version; an error that it raises ends the count.
     """
     objects = charged_bytes = 0
     for info in store.list(f"charges/{robot.folder}/"):
@@ -352,13 +393,13 @@ def sum_charges(store: ObjectStore, robot: RobotId, check: Callable[[], None] = 
 
 
 def remove_charges(store: ObjectStore, tenant: str, map_name: str, versions: Collection[str]) -> None:
-    """Delete the objects that count versions of a map for robots, so that no robot is charged any more.
+    """Delete the objects by which *versions* of a map are charged to robots.
 
     Args:
         store: The store of the maps.
         tenant: Folder of the tenant.
         map_name: Name of the map.
-        versions: Ids of the versions.
+        versions: Ids of the versions that are not charged any more.
     """
     for robot in store.folders(f"charges/{tenant}/"):
         prefix = f"charges/{tenant}/{robot}/{map_name}/"
@@ -369,7 +410,11 @@ def remove_charges(store: ObjectStore, tenant: str, map_name: str, versions: Col
 
 @dataclass(slots=True)
 class _RobotAccount:
-    """The bytes of one robot; *lock* guards the other fields."""
+    """The account of one robot in this process; *lock* guards the other fields.
+
+    *stored* is the usage that was counted at *counted_s* (monotonic seconds), with what this process has
+    stored since; *writing* is the usage of objects that this process writes now.
+    """
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     counted_s: float = _NEVER
@@ -378,7 +423,10 @@ class _RobotAccount:
 
 
 class Accounts:
-    """The accounts of all robots and tenants in one process.  Blocking; used by several threads."""
+    """The accounts of all robots and tenants in one process.
+
+    The methods block; several threads may call them.
+    """
 
     def __init__(
         self,
@@ -389,33 +437,36 @@ class Accounts:
         wall_clock: Callable[[], float] = time.time,
         check: Callable[[], None] = lambda: None,
     ) -> None:
-        """Count nothing yet.
+        """Create empty accounts; nothing is counted yet.
 
         Args:
-            store: Of the platform.
-            settings: With the quotas.
-            clock: Seconds, monotonic.
-            wall_clock: Unix seconds.
-            check: Called between two reads; ends the work by the error that it raises.
+            store: The store of the platform.
+            settings: Hold the quotas of robots and tenants that have no quota of their own.
+            clock: Returns monotonic seconds.
+            wall_clock: Returns Unix seconds.
+            check: Called between two reads of the store; an error that it raises ends the count.
         """
         self._store, self._settings = store, settings
         self._clock, self._wall_clock, self._check = clock, wall_clock, check
         self._recount_s = _recount_s(store)
-        self._lock = threading.Lock()  # of the dictionaries, never held during work
+        self._lock = threading.Lock()  # guards the dictionaries; never held while the store is read
         self._robots: OrderedDict[RobotId, _RobotAccount] = OrderedDict()
         self._tenants: OrderedDict[str, TenantAccount] = OrderedDict()
 
     @contextlib.contextmanager
     def reservation(self, robot: RobotId, size: int, max_bytes: float | None = None) -> Iterator[None]:
-        """Count one object of *size* bytes for a robot while it is written; take it back if that fails.
+        """Charge one object of *size* bytes to a robot and its tenant while the body writes it.
+
+        If the body raises an error, the charge is taken back.
 
         Args:
-            robot: Who stores it.
-            size: Of the object.
-            max_bytes: What the robot may store; None for ``data.quota_bytes``.
+            robot: The robot that stores the object.
+            size: Size of the object.
+            max_bytes: Own quota of the robot; None means ``data.quota_bytes``.
 
         Raises:
-            QuotaExceeded: The robot or its tenant would store more than its quota, or the robot more objects.
+            QuotaExceeded: The robot or its tenant would store more than its quota, or the robot would have
+                more than ``data.max_objects``.
             StoreFull: As for `TenantAccount.reserve`.
         """
         account, charge = self._account(robot), Usage(1, charge_of(size))
@@ -442,7 +493,10 @@ class Accounts:
                     account.stored += charge
 
     def check_room(self, robot: RobotId, size: int, max_bytes: float | None = None) -> None:
-        """Raise what `reservation` would raise for the robot now; nothing is reserved."""
+        """Raise QuotaExceeded if the robot's own limits do not allow one more object of *size* bytes.
+
+        Nothing is reserved, and the account of the tenant is not checked.
+        """
         account = self._account(robot)
         with account.lock:
             self._count_if_old(account, robot)
@@ -450,27 +504,27 @@ class Accounts:
             self._check_robot(robot, used, charge, max_bytes)
 
     def release(self, robot: RobotId, size: int) -> None:
-        """Count one object of *size* bytes less."""
+        """Take back the charge of one object of *size* bytes, which was removed, for robot and tenant."""
         account = self._account(robot)
         with account.lock:
             account.stored = _subtract(account.stored, Usage(1, charge_of(size)))
         self.tenant(robot.tenant).release(size)
 
     def forget(self, robot: RobotId) -> None:
-        """Count the robot's objects anew when it writes next."""
+        """Forget the count of *robot*: its objects are counted again when it stores one next."""
         account = self._account(robot)
         with account.lock:
             account.counted_s = _NEVER
 
     def forget_all(self, tenant: str) -> None:
-        """Count the robots of a tenant anew when they write next."""
+        """Forget the counts of all robots of *tenant*, as `forget` does."""
         with self._lock:
             robots = [robot for robot in self._robots if robot.tenant == tenant]
         for robot in robots:
             self.forget(robot)
 
     def tenant(self, tenant: str) -> TenantAccount:
-        """Return the account of a tenant."""
+        """Return the account of *tenant* in this process; make one if there is none."""
         return self._get_or_make(
             self._tenants, tenant,
             lambda: TenantAccount(
@@ -492,6 +546,7 @@ class Accounts:
             return account
 
     def _count_if_old(self, account: _RobotAccount, robot: RobotId) -> None:
+        """Count what *robot* stores, if the last count is older than the time between two counts."""
         now = self._clock()
         if now - account.counted_s >= self._recount_s:
             total = self._store.usage(f"objects/{robot.folder}/")
@@ -500,6 +555,7 @@ class Accounts:
             account.counted_s = now
 
     def _check_robot(self, robot: RobotId, used: Usage, charge: Usage, max_bytes: float | None) -> None:
+        """Raise QuotaExceeded if *robot*, which uses *used*, may not store *charge* more."""
         most, name = self._settings.quota_bytes, "data.quota_bytes"
         if max_bytes is not None:
             most, name = int(max_bytes), "its own quota"
@@ -518,8 +574,10 @@ class Accounts:
 
 
 def _recount_s(store: ObjectStore) -> float:
+    """Return the seconds between two counts of a store of this type."""
     return _RECOUNT_S if isinstance(store, DirectoryStore) else _SLOW_RECOUNT_S
 
 
 def _subtract(usage: Usage, charge: Usage) -> Usage:
+    """Return *usage* less *charge*, but not below 0."""
     return Usage(max(0, usage.objects - charge.objects), max(0, usage.charged_bytes - charge.charged_bytes))
