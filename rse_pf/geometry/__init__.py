@@ -1,9 +1,9 @@
 """Cameras, lenses and rigid transforms: the one convention of the platform.
 
 The camera frame looks along +z, with x to the right and y down.  A pose ``T_a_b`` is a ``(4, 4)`` float64
-matrix that maps points of frame *b* into frame *a*.  Lengths are metres, or the unit of length of a map or a
-trajectory without metric scale where a text says so.  Angles are radians.  Image coordinates are pixels, with
-the centre of the upper left pixel at (0, 0), x to the right and y down.
+matrix that maps points of frame *b* into frame *a*.  Lengths are in metres; where a text says so, they are in
+the unit of a map or a trajectory without metric scale.  Angles are in radians.  Image coordinates are in
+pixels, with the centre of the upper left pixel at (0, 0), x to the right and y down.
 
 `transforms` holds rotations and poses, `camera` the pinhole camera, and `lens` the camera with its
 distortion.

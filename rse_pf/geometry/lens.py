@@ -213,6 +213,10 @@ class Lens:
         return maps
 
     def _undistort(self, pixels: Array, K_new: Array | None) -> Array:
+        """Return ``(n, 2)`` distorted pixels as pixels of a pinhole camera with the camera matrix *K_new*.
+
+        With None the result are coordinates on the plane z = 1 of the camera frame.
+        """
         contiguous = np.ascontiguousarray(pixels).reshape(-1, 1, 2)
         points: Array = (
             LENS_MODELS[self.model]
@@ -276,7 +280,7 @@ def _distort_fisheye(cv2: Any, rays: Array, K: Array, coefficients: Array) -> An
     return cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), K, coefficients)
 
 
-# The radial-tangential model is that of Brown 1966, the equidistant fisheye that of Kannala and Brandt 2006.
+# All lens models: radial-tangential (Brown 1966), and equidistant fisheye (Kannala and Brandt 2006).
 _MODELS = (
     LensModel(
         name="radial-tangential",

@@ -1,4 +1,5 @@
-"""HTTP/1.1 of the platform: control ports, connections of services, and connections without a token.
+"""HTTP/1.1 of the platform: control ports, the connections of HTTP services, and unauthenticated connections.
 
-Routes are in `rse_pf.data_server` and in the control plane, WebSockets of robots in `rse_pf.server.gateway`.
+The routes are in `rse_pf.data_server` and in the control plane; the WebSockets of robots are in
+`rse_pf.server.gateway`.
 """

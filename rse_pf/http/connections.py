@@ -1,9 +1,9 @@
-"""HTTP/1.1 for services on uvicorn: one request at a time, with one meaning, and bounded connections.
+"""HTTP/1.1 connections of services that run on uvicorn: bounded, and with one request at a time.
 
-uvicorn's `HttpToolsProtocol` reads requests with llhttp.  By itself it waits for ever for the end of a head,
-has no bound on the size of a head, and accepts a request before it has answered the one before.
-`OneRequestProtocol` has these bounds, and refuses whatever two readers could understand differently (request
-smuggling).
+uvicorn's `HttpToolsProtocol` reads requests with llhttp.  It waits for ever for the end of a request head,
+has no bound on the size of a head, and accepts a request before it has answered the previous one.
+`OneRequestProtocol` has these bounds, and refuses a request that two HTTP implementations could understand
+differently (request smuggling).
 
 Source:
     RFC 9112, sections 2.2, 3, 5, 6 and 7.1.
@@ -24,18 +24,20 @@ _missing: ImportError | None = None
 try:
     import httptools
     from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
-except ImportError as error:  # as on a robot, which serves nothing: `bounded_protocol` reports it
+except ImportError as error:  # as on a robot, where no server runs; `bounded_protocol` raises MissingExtra
     HttpToolsProtocol, _missing = object, error  # type: ignore[assignment, misc]
 
 __all__ = ["MAX_HEADERS", "MAX_HEAD_BYTES", "OneRequestProtocol", "bounded_protocol"]
 
-MAX_HEAD_BYTES = 16384  # of one request: a token, the longest header, has at most 4 KiB
-MAX_HEADERS = 64  # of one request: browsers and load balancers send fewer than 30
-MAX_FRAMING_BYTES = 4096  # framing of a chunked body, apart from `FRAMING_SHIFT`: each chunk costs CPU time
-FRAMING_SHIFT = 3  # framing may also take an eighth (2**-3) of the data
-PARSED_AT_ONCE_BYTES = 16384  # bytes of a chunked body between two checks of its framing
-UNSENT_HIGH_BYTES = 1 << 19  # the application pauses when a client has not read this much of a reply
-UNSENT_LOW_BYTES = 1 << 18  # the application continues when no more than this is unread
+MAX_HEAD_BYTES = 16384  # largest head of a request: a token, the longest header, has at most 4 KiB
+MAX_HEADERS = 64  # most headers of a request: browsers and load balancers send fewer than 30
+# Bytes for the sizes and line ends of the chunks of a chunked body, in addition to those that `FRAMING_SHIFT`
+# allows.  A body of many tiny chunks would cost much CPU time.
+MAX_FRAMING_BYTES = 4096
+FRAMING_SHIFT = 3  # these bytes may also be an eighth (2**-3) of the data in the chunks
+PARSED_AT_ONCE_BYTES = 16384  # bytes of a chunked body between two checks of these bytes
+UNSENT_HIGH_BYTES = 1 << 19  # unsent bytes of a reply above which the application waits for the client
+UNSENT_LOW_BYTES = 1 << 18  # unsent bytes of a reply down to which the application waits then
 _END_OF_HEAD = b"\r\n\r\n"
 _HEAD = re.compile(
     rb"[A-Z]{1,16} /[!\"$-~]* HTTP/1\.1\r\n"  # no fragment: readers differ in what they do with "#"
@@ -51,14 +53,16 @@ def bounded_protocol(
     most_idle: int,
     ends_with_client: bool = False,
 ) -> Any:
-    """Return what uvicorn calls to make the protocol of each connection of one listener.
+    """Return the factory that uvicorn calls to make the protocol object of each connection of one listener.
 
     Args:
-        seconds: Time for the head of a request, from the connection or from the head's first byte.
-        idle_s: Time between an answer and the next request.
-        most: Connections that have sent no whole head; above that the oldest is closed.
-        most_idle: Idle connections after a reply; above that the one that is idle for longest is closed.
-        ends_with_client: Cancel the application when the client has disconnected.
+        seconds: Longest time for the head of a request, from the start of the connection for the first one,
+            otherwise from the first byte of the head.
+        idle_s: Longest time between a reply and the first byte of the next request.
+        most: Most connections that have not sent a whole head; above that the oldest one is closed.
+        most_idle: Most connections that are idle after a reply; above that the one that has been idle for
+            longest is closed.
+        ends_with_client: Whether the application is cancelled when its client disconnects.
 
     Raises:
         MissingExtra: uvicorn or httptools is not installed.
@@ -73,10 +77,10 @@ def bounded_protocol(
 
 
 class OneRequestProtocol(HttpToolsProtocol):
-    """A connection that carries one request after the other, each after the reply to the one before.
+    """An HTTP connection that accepts a request only after the reply to the previous one.
 
-    Load balancers and our own clients wait for a reply before they send the next request.  What comes earlier
-    is never taken for a request: the present one is answered, then the connection is closed.
+    Load balancers and our own clients wait for a reply before they send the next request.  If bytes arrive
+    earlier, they are not read as a request: the present request is answered, then the connection is closed.
     """
 
     def __init__(
@@ -87,35 +91,39 @@ class OneRequestProtocol(HttpToolsProtocol):
         *args: Any,
         **kwargs: Any,
     ) -> None:
-        """Make the protocol; the other arguments are those that uvicorn gives to `HttpToolsProtocol`."""
+        """Create the protocol object of one connection.
+
+        *silent* and *idle* count the connections without a whole head and after a reply; the further
+        arguments are those with which uvicorn creates an `HttpToolsProtocol`.
+        """
         super().__init__(*args, **kwargs)
         self._silent, self._idle, self._ends_with_client = silent, idle, ends_with_client
         self._served, self.app = self.app, self._serve
         self._task: asyncio.Task[Any] | None = None
-        self._head = b""  # what has come of a head that is not complete
+        self._head = b""  # the received part of a head that is not complete
         self._has_head = False
         self._is_chunked = False
         self._framing_bytes_left = 0
 
-    # --- called by the transport ---------------------------------------------------------------------
+    # --- methods that the transport calls -------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Count the connection as one that has sent nothing."""
+        """Begin to count the connection as one without a whole head, which is closed after `seconds`."""
         super().connection_made(transport)
         transport.set_write_buffer_limits(UNSENT_HIGH_BYTES, UNSENT_LOW_BYTES)
         self._silent.enter(self, transport.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Report to the application that its client has disconnected."""
+        """Report to the application that its client has disconnected; cancel it if ``ends_with_client``."""
         self._silent.leave(self)
         self._idle.leave(self)
         super().connection_lost(exc)
-        self.app = self._served  # no reference to itself is left, which would keep it in memory
+        self.app = self._served  # removes the object's reference to itself, which would keep it in memory
         if self._ends_with_client and self._task is not None and not self.cycle.response_complete:
             self._task.cancel()
 
     def data_received(self, data: bytes) -> None:
-        """Take a part of a head, a part of a body, or what no client sends that waits for its reply."""
+        """Process received bytes: a part of a head, a part of a body, or bytes that come too early."""
         if self.transport.is_closing():
             return
         if self._is_in_request():
@@ -142,23 +150,26 @@ class OneRequestProtocol(HttpToolsProtocol):
         self._parse(head)
         self._parse_body(body)
 
-    # --- called by llhttp; what is raised ends the parsing, and `_parse` refuses the request -----------
+    # --- methods that llhttp calls; after an exception in one, `_parse` refuses the request -------------
 
     def on_message_begin(self) -> None:
-        """Begin a request, unless one is being answered."""
+        """Begin a request; raise ValueError if the previous one is not answered yet."""
         if self._is_in_request():
             raise ValueError("a request came before the reply to the one before")
         super().on_message_begin()
         self._has_head = False
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header of the head; a trailer of a chunked body must not become one."""
+        """Add a header of the head; raise ValueError for a trailer (a header after a chunked body)."""
         if self._has_head:
             raise ValueError("a trailer")
-        super().on_header(name, value.rstrip(b" \t"))  # which llhttp leaves there
+        super().on_header(name, value.rstrip(b" \t"))  # llhttp does not remove these spaces
 
     def on_headers_complete(self) -> None:
-        """Start the application if the head has one host, at most one length of its body, and no upgrade."""
+        """Start the application for a complete head, or raise ValueError.
+
+        A valid head has one Host, at most one Content-Length or Transfer-Encoding, and no upgrade.
+        """
         hosts = sum(name == b"host" for name, _ in self.headers)
         lengths = [each for each in self.headers if each[0] in (b"content-length", b"transfer-encoding")]
         self._is_chunked = [each[0] for each in lengths] == [b"transfer-encoding"]
@@ -170,14 +181,14 @@ class OneRequestProtocol(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Take a part of a body, and allow more framing for it."""
+        """Pass a part of a body to the application, and allow more bytes of chunk framing for it."""
         self._framing_bytes_left += len(body) + (len(body) >> FRAMING_SHIFT)
         super().on_body(body)
 
-    # --- called by uvicorn ---------------------------------------------------------------------------
+    # --- the method that uvicorn calls after a reply ----------------------------------------------------
 
     def on_response_complete(self) -> None:
-        """Wait for the next request, or close the connection if the present one was not read to its end."""
+        """Wait for the next request, or close the connection if a part of the body was not read."""
         self.server_state.total_requests += 1
         if self.cycle.more_body:
             self.transport.close()
@@ -188,10 +199,11 @@ class OneRequestProtocol(HttpToolsProtocol):
     # -------------------------------------------------------------------------------------------------
 
     def _is_in_request(self) -> bool:
+        """Return whether a request has begun whose reply is not complete."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _parse_body(self, data: bytes) -> None:
-        """Parse what follows a head, and refuse too much chunk framing."""
+        """Parse bytes after a head; refuse the request if its chunks have too many bytes of framing."""
         step = PARSED_AT_ONCE_BYTES if self._is_chunked else max(len(data), 1)
         for start in range(0, len(data), step):
             if self.transport.is_closing():
@@ -206,6 +218,11 @@ class OneRequestProtocol(HttpToolsProtocol):
                 self._refuse()
 
     def _parse(self, data: bytes) -> None:
+        """Pass *data* to llhttp.
+
+        After an error the request is refused; if it was complete, its reply is sent before the connection is
+        closed.
+        """
         try:
             self.parser.feed_data(data)
         except httptools.HttpParserError:
@@ -219,13 +236,13 @@ class OneRequestProtocol(HttpToolsProtocol):
         self.flow.pause_reading()
 
     def _refuse(self) -> None:
-        """Answer 400 unless a reply has begun, and close the connection."""
+        """Answer with the status 400, unless a reply has begun, and close the connection."""
         if self.transport.is_closing():
             return
         has_begun = False
         if self._is_in_request():
             has_begun = self.cycle.response_started
-            self.cycle.disconnected = True  # so that nothing more is sent
+            self.cycle.disconnected = True  # the application sends nothing more
             self.cycle.message_event.set()
         if has_begun:
             self.transport.close()
@@ -233,7 +250,7 @@ class OneRequestProtocol(HttpToolsProtocol):
             self.send_400_response("Invalid HTTP request received.")
 
     async def _serve(self, scope: Any, receive: Any, send: Any) -> None:
-        """Run the application; `connection_lost` may cancel it, which is no error."""
+        """Run the application for one request; a cancellation by `connection_lost` is no error."""
         self._task = asyncio.current_task()
         if not self.cycle.disconnected:
             with contextlib.suppress(asyncio.CancelledError):

@@ -1,7 +1,8 @@
 """Serve control ports: a very small HTTP/1.1 server for health checks, metrics, drain and other operations.
 
-A request has a head of at most 8 KiB and no chunked body.  The first request of a connection must be complete
-within `FIRST_REQUEST_S`, and each later one within `KEEP_ALIVE_S` after the reply before it.
+A request has a head of at most 8 KiB, and a body of at most 64 KiB that is not chunked.  The first request of
+a connection must be complete within `FIRST_REQUEST_S`, and each later one within `KEEP_ALIVE_S` after the
+previous reply.
 """
 
 from __future__ import annotations
@@ -20,15 +21,19 @@ from rse_pf.http.unauthenticated import BACKLOG, FIRST_REQUEST_S, KEEP_ALIVE_S, 
 
 __all__ = ["ControlReply", "ControlRequest", "json_reply", "number_of", "refused_reply", "serve_control"]
 
-_MAX_HEAD_BYTES = 8192
-_MAX_BODY_BYTES = 65536
+_MAX_HEAD_BYTES = 8192  # largest head of a request
+_MAX_BODY_BYTES = 65536  # largest body of a request, which is read and ignored
 _WRITE_S = 5.0
-"""The connection of a client that takes longer to read a reply is closed."""
+"""Seconds after which the connection of a client that does not read a reply, or an event, is closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlRequest:
-    """One request.  ``is_local``: from this machine, and not by a web page."""
+    """One request to a control port.
+
+    ``method`` is GET for a HEAD request.  ``is_local`` is whether the request came from this machine and not
+    from a web page (it has no header Origin).  ``authorization`` is the header's value, "" if absent.
+    """
 
     method: str
     path: str
@@ -39,7 +44,10 @@ class ControlRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlReply:
-    """One response: *body*, or *events* as lines of JSON, after which the connection is closed."""
+    """One reply of a control port: *body*, or *events*.
+
+    Each of the *events* is sent as one line of JSON; after the last one the connection is closed.
+    """
 
     status: int = 200
     body: bytes = b""
@@ -49,17 +57,21 @@ class ControlReply:
 
 
 def json_reply(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:
-    """Return *value* as JSON."""
+    """Return a reply with *value* as one line of JSON."""
     return ControlReply(status=status, body=_line(value), headers=headers or {})
 
 
 def refused_reply(status: int, code: str, hint: str) -> ControlReply:
-    """Return a refusal: a stable code, and what to do."""
+    """Return a reply with the HTTP *status* that refuses a request: a stable code, and what to do."""
     return json_reply({"code": code, "hint": hint}, status=status)
 
 
 def number_of(ask: ControlRequest, name: str, default: float, maximum: float) -> float:
-    """Return a parameter of a request; raises ValueError if it is none from 0 to *maximum*."""
+    """Return the number in the query parameter *name* of a request, *default* if it is absent.
+
+    Raises:
+        ValueError: The parameter is no number from 0 to *maximum*.
+    """
     value = float(ask.query.get(name, default))
     if not 0 <= value <= maximum:
         raise ValueError(name)
@@ -73,9 +85,9 @@ async def serve_control(
     *,
     first_request_s: float = FIRST_REQUEST_S,
 ) -> asyncio.Server:
-    """Listen on *host* and *port* (0 takes a free one) and answer each request with *answer*.
+    """Listen on *host* and *port* (0 takes a free port), and answer each request by *answer*.
 
-    A connection is cut *first_request_s* after its beginning if its first request is not complete.
+    A connection whose first request is not complete after *first_request_s* seconds is closed.
     """
     silent: SilentConnections[asyncio.StreamWriter] = SilentConnections(
         call_later=asyncio.get_running_loop().call_later, seconds=first_request_s
@@ -103,8 +115,8 @@ async def serve_control(
             asyncio.TimeoutError,
             asyncio.CancelledError,
         ):
-            # A malformed request ends its own connection only; at the end of the loop asyncio would log an
-            # error for each connection that was kept alive.
+            # A malformed request closes its own connection only.  A cancellation is not raised again, because
+            # asyncio would log an error for each open connection when the event loop ends.
             pass
         finally:
             silent.leave(writer)
@@ -119,7 +131,13 @@ async def _exchange(
     writer: asyncio.StreamWriter,
     answer: Callable[[ControlRequest], Awaitable[ControlReply]],
 ) -> bool:
-    """Serve one request; return whether another may follow."""
+    """Read one request and send the reply of *answer*; return whether the connection is kept for another.
+
+    Raises:
+        ValueError: The request is malformed.
+        EOFError: The client has closed the connection.
+        TimeoutError: The client did not read the reply within `_WRITE_S`.
+    """
     head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
     request_line, *lines = head.rstrip("\r\n").split("\r\n")
     method, target, version = request_line.split(" ")

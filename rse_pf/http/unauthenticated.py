@@ -1,8 +1,8 @@
 """Bound the number and the age of connections that have not sent their first whole request.
 
-An unauthenticated client can make a server spend what such a connection costs.  Each listener of the platform
-counts these connections here, and closes the oldest ones.  This module neither reads requests nor checks
-tokens.
+Anybody can open such connections, and each costs the server memory and a file descriptor.  Each listener of
+the platform counts them by a class of this module, which closes the oldest ones.  This module neither reads
+requests nor checks tokens.
 """
 
 from __future__ import annotations
@@ -27,45 +27,54 @@ __all__ = [
 ]
 
 FIRST_REQUEST_S = 6.0
-"""Time from the acceptance of a connection to its first whole request head or Hello.  With 5,000 silent
-connections, waiting for acceptance and closing take up to four seconds more: ten seconds in all."""
+"""Longest time in seconds from the acceptance of a connection to the end of its first request head or Hello.
+With 5,000 silent connections, the wait for acceptance and the closing take up to four seconds more: ten
+seconds in all."""
 BACKLOG = 4096
-"""Connections that wait for acceptance.  Above that the kernel drops connections, those of robots included,
-and clients retry after 1 and 3 s.  The kernel limits the value to net.core.somaxconn."""
+"""Most connections of a listener that wait for acceptance.  Above that the kernel drops new connections,
+including those of robots, and clients retry after 1 and 3 s.  The kernel limits the value to
+net.core.somaxconn."""
 KEEP_ALIVE_S = BALANCER_IDLE_TIMEOUT_S + 10.0
-"""How long a connection may be idle after a reply.  It exceeds the idle timeout of load balancers, which
-otherwise send requests on connections that are being closed."""
+"""Longest time in seconds for which a connection may be idle after a reply.  It exceeds the idle timeout of
+load balancers, which would otherwise send requests on connections that the server is closing."""
 MAX_SILENT = 256
-"""Connections of one listener that have sent no whole request; robots send theirs within milliseconds."""
+"""Most connections of one listener that have not sent a whole request; robots send one within
+milliseconds."""
 _MAX_ACCEPTED_AT_ONCE = 32
-"""Connections that are accepted in one round of the event loop, so that others are served in between."""
+"""Most connections that are accepted in one iteration of the event loop, so that other connections are served
+in between."""
 _MAX_SILENT_TLS = 128
-"""As `MAX_SILENT`, for a listener with TLS, where a handshake takes some 300 KiB of memory."""
+"""The same as `MAX_SILENT` for a listener with TLS, where a handshake takes some 300 KiB of memory."""
 _ACCEPT_PAUSE_S = 0.2
-"""Pause after accept failed: the process has no file descriptor left until a connection is closed."""
+"""Seconds for which a listener pauses after accept(2) failed, because the process has no file descriptor
+left until a connection is closed."""
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 class PendingHandshakes(Generic[Key]):
-    """Sockets that have not sent a token yet; above a limit, the one that waited longest is closed.
+    """Counts sockets that have not sent a token yet; above a limit it names the oldest one, to be closed.
 
-    A robot sends its token within milliseconds, so the socket that waited longest is least likely a robot's.
-    If the newest socket were closed instead, a few silent sockets would lock robots out.
+    A robot sends its token within milliseconds, so the oldest socket is least likely that of a robot.  If the
+    newest socket were closed instead, a few silent sockets would prevent robots from connecting.
     """
 
     def __init__(self, max_sockets: int, max_per_source: int) -> None:
+        """Begin without sockets; *max_per_source* limits those of one source address, 0 is no limit."""
         self._max_sockets = max_sockets
         self._max_per_source = max_per_source
         self._sources: dict[Key, str] = {}
         self._of_source: dict[str, dict[Key, None]] = {}
 
     def __len__(self) -> int:
-        """Return the number of sockets."""
+        """Return the number of counted sockets."""
         return len(self._sources)
 
     def enter(self, key: Key, source: str) -> Key | None:
-        """Add *key*; return the key to close for it, None within the limits."""
+        """Count the socket *key* from the address *source*; return the socket that the caller has to close.
+
+        That socket is not counted any more.  None if no limit is exceeded.
+        """
         self._sources[key] = source
         own = self._of_source.setdefault(source, {})
         own[key] = None
@@ -79,7 +88,7 @@ class PendingHandshakes(Generic[Key]):
         return leaving
 
     def leave(self, key: Key) -> None:
-        """Remove a socket that sent a token, or was closed."""
+        """Stop counting the socket *key*, which sent a token or was closed; do nothing if it is unknown."""
         source = self._sources.pop(key, None)
         if source is None:
             return
@@ -90,7 +99,10 @@ class PendingHandshakes(Generic[Key]):
 
 
 class SilentConnections(Generic[Key]):
-    """The connections of one listener that have sent no whole request yet."""
+    """The connections of one listener that have not sent a whole request yet.
+
+    A connection is closed when it is too old, or when it is the oldest one of too many.
+    """
 
     def __init__(
         self,
@@ -100,23 +112,23 @@ class SilentConnections(Generic[Key]):
         most: int = MAX_SILENT,
         most_per_source: int = 0,
     ) -> None:
-        """Count no connection yet.
+        """Begin without connections.
 
         Args:
-            call_later: Method of the event loop.
-            seconds: Age at which a connection is closed.
-            most: Number of connections above which the oldest is closed.
-            most_per_source: The same for the connections of one address; 0 is no limit.
+            call_later: The method of that name of the event loop.
+            seconds: Age in seconds at which a connection is closed.
+            most: Number of connections above which the oldest one is closed.
+            most_per_source: The same for the connections from one source address; 0 is no limit.
         """
         self.cut = 0
-        """Number of connections that were closed."""
+        """Number of connections that this object has closed."""
         self._line: PendingHandshakes[Key] = PendingHandshakes(most, most_per_source)
         self._call_later = call_later
         self._seconds = seconds
         self._waiting: dict[Key, tuple[asyncio.TimerHandle, Callable[[], object], str]] = {}
 
     def __len__(self) -> int:
-        """Return the number of connections."""
+        """Return the number of counted connections."""
         return len(self._waiting)
 
     def __contains__(self, key: Key) -> bool:
@@ -124,9 +136,9 @@ class SilentConnections(Generic[Key]):
         return key in self._waiting
 
     def enter(self, key: Key, cut: Callable[[], object], source: str = "") -> None:
-        """Count the connection *key* from the address *source*; *cut* closes it.
+        """Count the connection *key* from the address *source* from now on; *cut* is called to close it.
 
-        A connection that is counted already keeps its age.
+        A connection that is counted already keeps its age.  If there are too many now, the oldest is closed.
         """
         if key in self._waiting:
             return
@@ -136,7 +148,10 @@ class SilentConnections(Generic[Key]):
             self._cut(surplus)
 
     def leave(self, key: Key) -> str | None:
-        """Remove a connection that sent its request, or ended; return its address, None if it is unknown."""
+        """Stop counting the connection *key*, which sent its request or was closed.
+
+        Returns its source address, None if it was not counted.
+        """
         entry = self._waiting.pop(key, None)
         if entry is None:
             return None
@@ -146,7 +161,7 @@ class SilentConnections(Generic[Key]):
         return source
 
     def cut_all(self) -> None:
-        """Close all connections, because the server stops."""
+        """Close all counted connections, because the server stops."""
         for key in list(self._waiting):
             self._cut(key)
 
@@ -158,10 +173,10 @@ class SilentConnections(Generic[Key]):
 
 
 class TlsListener:
-    """Accept connections with TLS; a client that sends nothing costs a socket only.
+    """Accepts connections with TLS, and bounds those of clients that have not authenticated themselves.
 
-    asyncio creates the TLS objects, some 300 KiB, when it accepts a connection.  This listener creates them
-    when the first bytes arrive.
+    asyncio creates the TLS objects of a connection, some 300 KiB, when it accepts the connection.  This
+    listener creates them when the first bytes arrive, so that a silent client costs a socket only.
     """
 
     def __init__(
@@ -174,16 +189,17 @@ class TlsListener:
         most: int = _MAX_SILENT_TLS,
         most_per_source: int = _MAX_SILENT_TLS // 2,
     ) -> None:
-        """Accept nothing yet.
+        """Prepare the listener; `open` begins to accept connections.
 
         Args:
             listening: A listening socket; `close` closes it.
             context: TLS context of a server.
             serve: A coroutine function that is called after the TLS handshake with a reader, a writer, and a
                 function to call when the client has authenticated itself.
-            seconds: See `SilentConnections`; the handshake is included.
-            most: See `SilentConnections`.
-            most_per_source: See `SilentConnections`.
+            seconds: Seconds after which a client that has not authenticated itself is disconnected: first
+                from the acceptance to its first bytes, then from these on.
+            most: Most connections of such clients; above that the oldest one is closed.
+            most_per_source: Most connections of such clients from one source address.
         """
         self._listening = listening
         self._context = context
@@ -199,12 +215,12 @@ class TlsListener:
         self._pause: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
-        """Begin to accept."""
+        """Begin to accept connections, also again after a pause."""
         self._listening.setblocking(False)
         self._loop.add_reader(self._listening.fileno(), self._accept)
 
     def close(self) -> None:
-        """Stop accepting and close unauthenticated connections; the others go on."""
+        """Stop accepting, and close unauthenticated connections; authenticated connections stay open."""
         if self._pause is not None:
             self._pause.cancel()
         self._loop.remove_reader(self._listening.fileno())
@@ -231,7 +247,7 @@ class TlsListener:
         accepted.close()
 
     def _begin(self, accepted: socket.socket) -> None:
-        """Start the TLS handshake, because the first bytes, or the end of the connection, arrived."""
+        """Start the TLS handshake of *accepted*, after its first bytes, or its end, have arrived."""
         self._loop.remove_reader(accepted.fileno())
         source = self.silent.leave(accepted) or ""
         self._raw.add(accepted)
@@ -248,6 +264,7 @@ class TlsListener:
             accepted.close()
 
     async def _shake_hands(self, accepted: socket.socket) -> None:
+        """Make the TLS handshake, then serve the connection; return at once if the handshake fails."""
         task = asyncio.current_task()
         reader = asyncio.StreamReader()
         try:

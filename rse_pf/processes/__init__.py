@@ -1,5 +1,6 @@
 """Start, limit and stop child processes of the platform, and exchange messages with them.
 
-A child is a new interpreter that runs one function and has one socket to its parent.  Servers, which may
-outlive what started them, are `rse_pf.local.processes`; workers are forked from their supervisor.
+A child is a new Python interpreter that runs one function and has one socket to its parent.  Servers, which
+may outlive the program that started them, are started by `rse_pf.local.processes`; the workers of a server
+are forked from its supervisor.
 """

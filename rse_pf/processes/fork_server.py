@@ -1,8 +1,9 @@
-"""A fork server: a child process that imports modules once, and forks, kills and reaps processes on order.
+"""A fork server: a child process that imports modules once, and forks, kills and reaps further processes.
 
-Orders and reports are JSON, one in each packet of its socket, and may carry descriptors.  A fork
-server works for one level of trust: each user of this module starts its own, and that of sandboxes has no
-environment variables, keys and sockets of a server.
+Its parent sends orders, and receives reports.  Both are JSON, one in each packet of the socket, and may carry
+file descriptors.  Each module that needs forks starts a fork server of its own, because forks inherit the
+memory and the descriptors of the fork server: that of sandboxes has no environment variables, keys and
+sockets of a server.
 """
 
 from __future__ import annotations
@@ -24,33 +25,48 @@ from rse_pf.processes.start import Child, ChildPlan, how_ended, start_child
 
 __all__ = ["ForkPlan", "read_packet", "send_order", "serve_forks", "start_fork_server"]
 
-_MAX_PACKET_BYTES = 1 << 20  # a configuration has at most 100 kB
-_MAX_DESCRIPTORS = 2  # that one packet carries
+_MAX_PACKET_BYTES = 1 << 20  # largest packet: a configuration has at most 100 kB
+_MAX_DESCRIPTORS = 2  # most file descriptors that one packet carries
 
 
-# --- the parent's side ------------------------------------------------------------------------------------
+# --- functions for the parent of a fork server ------------------------------------------------------------
 
 
 def start_fork_server(
     plan: ChildPlan, configuration: Any, *, environment: Mapping[str, str] | None = None
 ) -> Child:
-    """Start a fork server, whose function gets *configuration* as its first packet; raises OSError."""
+    """Start the fork server *plan*; raises OSError.
+
+    Its function receives *configuration*, a JSON value, as its first packet.  *environment* are its
+    environment variables; None means those of this process.
+    """
     child = start_child(plan, environment=environment, kind=socket.SOCK_SEQPACKET, output=2)
-    with suppress(OSError):  # it has ended, which the next read shows
+    with suppress(OSError):  # the fork server has exited, which the next read shows
         child.connection.send(json.dumps(configuration).encode())
     return child
 
 
 def send_order(server: Child, do: str, number: int, *descriptors: int) -> None:
-    """Order to ``create`` or to ``end`` a fork; raises OSError if the server ended, or is behind."""
+    """Order the fork server to ``create`` or to ``end`` (*do*) the fork with this *number*.
+
+    *descriptors* are passed to a new fork.
+
+    Raises:
+        OSError: The fork server has exited, or does not read its socket fast enough.
+    """
     socket.send_fds(server.connection, [json.dumps({"do": do, "id": number}).encode()], descriptors)
 
 
 def read_packet(connection: socket.socket) -> tuple[Any, list[int]]:
-    """Return the next packet and its descriptors, None at the end; raises BlockingIOError.
+    """Return the next packet as a JSON value, and its file descriptors; None if the other side has exited.
 
-    A parent reads ``ready``, ``created`` with the ``pid`` and a descriptor of the process, and ``gone`` with
-    how it ended and the CPU seconds that it took, each as an ``event``.
+    A parent receives reports, whose ``event`` is ``ready`` (the fork server), ``created`` with the ``pid``
+    and a descriptor of the fork's process, or ``gone`` with how the fork ended (``how``) and its CPU seconds
+    (``cpu_s``).
+
+    Raises:
+        BlockingIOError: The socket does not block, and there is no packet.
+        TimeoutError: No packet came within the time limit of the socket.
     """
     try:
         message, descriptors, _, _ = socket.recv_fds(connection, _MAX_PACKET_BYTES, _MAX_DESCRIPTORS)
@@ -61,27 +77,35 @@ def read_packet(connection: socket.socket) -> tuple[Any, list[int]]:
     return (json.loads(message) if message else None), descriptors
 
 
-# --- the fork server ----------------------------------------------------------------------------------------
+# --- functions of the fork server itself --------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForkPlan:
-    """What a fork server does for each fork."""
+    """The functions that a fork server calls for its forks."""
 
     fork: Callable[[int, list[int]], int]
-    """Forks process *number* with the descriptors of its order; returns its pid, 0 if it could not."""
+    """Forks the process *number*, with the descriptors of its order; returns its pid, 0 if that failed."""
     begin: Callable[[int, int], str] = lambda number, pid: ""
-    """Starts the work of process *number* after its *pid* was reported; returns why to kill it, or ""."""
+    """Starts the work of the fork *number* after its pid was reported; returns a reason to kill it, or ""."""
     free: Callable[[int], str] = lambda number: ""
-    """Frees the resources of process *number*; returns why it ended, or "" if its exit code shows that."""
+    """Frees the resources of the fork *number*, which has exited; returns how it ended, or "" if its exit
+    code says that."""
     watch: Callable[[list[int]], tuple[dict[int, str], float]] | None = None
-    """Checks all forks, by pid; returns why to kill some of them, and the seconds until the next check."""
+    """Checks the forks with these pids; returns, by pid, the reasons to kill some of them, and the seconds
+    until the next check."""
     keeps_ended: bool = False
-    """Whether a process that ended keeps its pid, and is reported, only when its end is ordered."""
+    """Whether a fork that exited is reaped and reported only when ``end`` is ordered for it, not at once."""
 
 
 def serve_forks(parent: socket.socket, plan: ForkPlan, **ready: Any) -> None:
-    """Report that this process is ready, and follow the orders of *parent* until it exits; kill all forks."""
+    """Report ``ready`` to the parent, and execute its orders until it exits; then kill all forks and return.
+
+    Args:
+        parent: The socket to the parent.
+        plan: The functions for the forks.
+        ready: Further members of the report ``ready``.
+    """
     _Forks(parent, plan).run(ready)
 
 
@@ -89,7 +113,7 @@ def serve_forks(parent: socket.socket, plan: ForkPlan, **ready: Any) -> None:
 class _Fork:
     number: int
     handle: int
-    """Descriptor of its process."""
+    """Descriptor of the fork's process (pidfd)."""
 
 
 class _Forks:
@@ -97,11 +121,11 @@ class _Forks:
         self._parent = parent
         self._plan = plan
         self._forks: dict[int, _Fork] = {}
-        """By pid."""
+        """The forks that were not reaped yet, by pid."""
         self._reasons: dict[int, str] = {}
-        """Why forks were killed that are still ending, by pid."""
-        self._look_s = 0.0
-        """When `ForkPlan.watch` looks next."""
+        """By pid of a fork that was killed and not reaped yet: the reason."""
+        self._next_watch_s = 0.0
+        """Monotonic time of the next call of `ForkPlan.watch`."""
         self._poll = select.poll()
 
     def run(self, ready: dict[str, Any]) -> None:
@@ -125,26 +149,26 @@ class _Forks:
             self._reap(wait=True)
 
     def _wait_ms(self) -> float | None:
-        """Return how long there is nothing to do without an event; None is forever."""
+        """Return the milliseconds until the next call of `ForkPlan.watch`, None if none is planned."""
         if self._plan.watch is None or not self._forks:
             return None
-        return max(0.0, self._look_s - time.monotonic()) * 1e3
+        return max(0.0, self._next_watch_s - time.monotonic()) * 1e3
 
     def _watch(self) -> None:
         watch = self._plan.watch
-        if watch is None or not self._forks or time.monotonic() < self._look_s:
+        if watch is None or not self._forks or time.monotonic() < self._next_watch_s:
             return
         reasons, pause_s = watch(list(self._forks))
         for pid, reason in reasons.items():
             self._kill(pid, reason)
-        self._look_s = time.monotonic() + pause_s
+        self._next_watch_s = time.monotonic() + pause_s
 
     def _kill(self, pid: int, reason: str) -> None:
         self._reasons[pid] = reason
         os.kill(pid, signal.SIGKILL)
 
     def _follow_order(self) -> bool:
-        """Follow one order; return False when the parent has exited."""
+        """Execute one order of the parent; return False if the parent has exited."""
         order, descriptors = read_packet(self._parent)
         if order is None:
             return False
@@ -152,7 +176,7 @@ class _Forks:
             self._create(order["id"], descriptors)
         else:
             for pid in [pid for pid, fork in self._forks.items() if fork.number == order["id"]]:
-                os.kill(pid, signal.SIGKILL)  # it is not reaped yet, so no other process has this id
+                os.kill(pid, signal.SIGKILL)  # the fork is not reaped yet, so no other process has this pid
                 if self._plan.keeps_ended:
                     self._reap(pid, wait=True)
         for fd in descriptors:
@@ -174,7 +198,10 @@ class _Forks:
             self._kill(pid, reason)
 
     def _reap(self, which: int = -1, *, wait: bool = False) -> None:
-        """Reap and report the fork *which*, or each one that has ended; with *wait* all of them."""
+        """Reap and report the fork with the pid *which* (-1: each fork) if it has exited.
+
+        With *wait*, wait until the fork (-1: all forks) has exited.
+        """
         while self._forks:
             try:
                 pid, status, used = os.wait4(which, 0 if wait else os.WNOHANG)

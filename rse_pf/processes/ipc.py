@@ -1,8 +1,8 @@
 """Messages between processes of the platform, on stream sockets.
 
-A message is its length and its MessagePack body.  Child processes and their parents use this format, and
-servers that pass commands of live maps on.  What needs numpy is imported with the first message: a data
-server starts processes, and starts without it.
+A message is a length and a body in MessagePack.  Child processes and their parents use this format, and also
+servers that forward commands of live maps to each other.  Modules that need numpy are imported at the first
+message, because a data server uses this package but starts without numpy.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
 
 __all__ = ["FrameReader", "encode_message", "encode_reply", "receive", "receive_bytes"]
 
-_HEADER = struct.Struct("<I")
-_PIECE_BYTES = 1 << 18
+_HEADER = struct.Struct("<I")  # the length of a message in bytes, before its body
+_PIECE_BYTES = 1 << 18  # most bytes that one call receives from a socket with a time limit
 
 
 class _Coding(NamedTuple):
+    """The functions that encode and decode a body, and that check its size before it is decoded."""
+
     encode: Callable[[Any], bytes]
     decode: Callable[[bytes], Any]
     check: Callable[[bytes], object]
@@ -33,7 +35,10 @@ class _Coding(NamedTuple):
 
 @cache
 def _coding() -> _Coding:
-    """Import once what needs numpy: six imports a call were 7 us of a sandbox's call."""
+    """Return the functions for bodies; import the modules for that at the first call only.
+
+    The import statements would otherwise take 7 us of each call of a sandbox.
+    """
     from rse_pf.limits import budget
     from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
@@ -45,16 +50,16 @@ def _coding() -> _Coding:
 
 
 def encode_message(message: Any) -> bytes:
-    """Return *message* with its length before it."""
+    """Return *message* encoded, with its length before it."""
     body = _coding().encode(message)
     return _HEADER.pack(len(body)) + body
 
 
 def encode_reply(message: Any) -> bytes:
-    """Return *message* of a sandbox with its length before it.
+    """Return *message*, a reply of a sandbox, encoded with its length before it.
 
     Raises:
-        LimitExceeded: The worker would refuse it for its values or levels.
+        LimitExceeded: It has more values or levels of nesting than the worker would accept.
     """
     data = encode_message(message)
     _coding().check(data[_HEADER.size :])
@@ -62,11 +67,11 @@ def encode_reply(message: Any) -> bytes:
 
 
 def receive(connection: socket.socket, until: float | None = None) -> Any:
-    """Return the next message on a blocking socket, None at its end.
+    """Return the next message on a blocking socket; None if the other side has closed it.
 
     Args:
-        connection: Its other side is trusted: no limit holds.
-        until: Monotonic time, s, after which TimeoutError is raised; None waits for ever.
+        connection: The socket.  Its other side is trusted, so there is no limit for the size of a message.
+        until: Monotonic time in seconds after which TimeoutError is raised; None waits for ever.
     """
     header = receive_bytes(connection, _HEADER.size, until)
     if len(header) < _HEADER.size:
@@ -77,13 +82,13 @@ def receive(connection: socket.socket, until: float | None = None) -> Any:
 
 
 def receive_bytes(connection: socket.socket, size: int, until: float | None = None) -> bytes:
-    """Return the next *size* bytes on a blocking socket, fewer at its end.
+    """Return the next *size* bytes on a blocking socket; fewer if the other side has closed it.
 
     Raises:
-        TimeoutError: The monotonic time *until*, s, has passed.
+        TimeoutError: The monotonic time *until* (s) has passed; None waits for ever.
     """
     received = bytearray()
-    with suppress(ConnectionResetError):  # it ended and left bytes unread
+    with suppress(ConnectionResetError):  # the other side exited, and left bytes unread
         if until is None:
             return connection.recv(size, socket.MSG_WAITALL)
         while len(received) < size:
@@ -96,18 +101,18 @@ def receive_bytes(connection: socket.socket, size: int, until: float | None = No
 
 
 class FrameReader:
-    """Splits the bytes of a stream into messages of at most *max_bytes*."""
+    """Splits a stream from a process that is not trusted into messages of at most *max_bytes*."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
         self._received = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Any]:
-        """Yield every message that *data* completes.
+        """Add *data*, and yield each message that is complete now.
 
         Raises:
-            LimitExceeded: A message is longer than the limit, or holds too many values or levels.
-            BadMessage: A body is not MessagePack.
+            LimitExceeded: A message is longer than *max_bytes*, or holds too many values or levels.
+            BadMessage: The body of a message is not MessagePack.
         """
         self._received += data
         while len(self._received) >= _HEADER.size:

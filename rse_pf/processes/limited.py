@@ -3,15 +3,15 @@
     with LimitedProcesses("rse_pf.maps.describe:describer", ProcessLimits(memory_bytes=1 << 28)) as processes:
         description = processes.call(data, timeout_s=5.0)
 
-``describer`` is called once, in a template process that has one thread, with the configuration; it imports
-what the work needs and returns a function from bytes to bytes.  Each process is forked from the template and
-answers one call after the other, so what that function caches stays until its process is killed.  A process
-that was killed is replaced in some milliseconds.  `LimitedProcesses.call` blocks and may be called by several
-threads.
+``describer`` is called once with the configuration, in a template process that has one thread.  It imports
+the modules that the work needs, and returns the handler, a function from bytes to bytes.  Each process is
+forked from the template and answers one call after the other, so values that the handler caches stay until
+its process is killed.  A process that was killed is replaced in some milliseconds.  `LimitedProcesses.call`
+blocks, and may be called by several threads.
 
-Bytes that crash their process, or exhaust its memory or CPU time, cost that process only.  Only such bytes
-raise Crashed, which counts against their sender; the other errors do not.  This is no sandbox: code that took
-over the process has the permissions of its user.
+Bytes that crash their process, or exhaust its memory or CPU time, damage no other process.  Only such bytes
+raise Crashed, which the caller counts against their sender; the other errors do not count.  The processes are
+no sandbox: code that takes over a process has the permissions of its user.
 """
 
 from __future__ import annotations
@@ -57,31 +57,44 @@ __all__ = [
 ]
 
 Handler = Callable[[bytes], bytes]
-"""What answers a call; raises MemoryError, or an `RsePfError` that the caller is to see."""
+"""Computes the reply to the bytes of a call; an `RsePfError` that it raises is raised in the caller, too.
+
+After a MemoryError the process exits, and the caller gets Crashed."""
 
 DEFAULT_NICENESS = 5
+"""Niceness of the processes above that of the process that starts them."""
 _MAX_REPLY_BYTES = 1 << 20
+"""Most bytes of a reply, if `ProcessLimits` sets no other limit."""
 _ORDER_TIMEOUT_S = 10.0
-"""A template that does not fork or kill a process within this time is replaced: it hangs."""
+"""Seconds within which the template must fork or kill a process; otherwise it hangs, and is replaced."""
 _BUSY_RETRY_MS = 1000.0
+"""Milliseconds after which a caller may try again if no process was free."""
 _NEAR = 4
-"""Values of *near* that are remembered for each process, which caches the data of a few only."""
+"""Number of the latest different values of *near* that are remembered for each process: a process caches the
+data of a few calls only."""
 _OUT_OF_MEMORY = 77
 """Exit code of a process whose handler raised MemoryError."""
 _NO_MEMORY = how_ended(_OUT_OF_MEMORY)
+"""How the fork server reports a process that exited at its memory limit."""
 _NO_TIME = how_ended(-signal.SIGPROF)
-"""How a process ends at its CPU limit: it arms the timer of this signal before each call."""
+"""How the fork server reports a process that was ended at its CPU limit: the kernel sends it this signal."""
 _LENGTH = struct.Struct("<Q")
+"""Head of a call: the number of bytes that follow."""
 _REPLY = struct.Struct("<BQd")
-"""Kind and length of what follows, and the CPU seconds of the process so far."""
-# Kinds of a reply: the result, an `RsePfError` of the handler, or another exception of the handler.
+"""Head of a reply: its kind, the number of bytes that follow, and the CPU seconds of the process so far."""
 _DONE = 0
+"""Kind of a reply: the result of the handler."""
 _REFUSED = 1
+"""Kind of a reply: an `RsePfError` that the handler raised."""
 _DEFECT = 2
+"""Kind of a reply: the handler raised another exception."""
 
 
 class Overran(Expired):
-    """The timeout passed during the work, which had taken ``cpu_s`` seconds of CPU time, and was killed."""
+    """The timeout of a call passed while its process worked on it, and the process was killed.
+
+    ``cpu_s`` are the CPU seconds that the work had taken.
+    """
 
     def __init__(self, timeout_s: float, cpu_s: float) -> None:
         super().__init__(f"the work took longer than {timeout_s:.3g} s and was ended", hint="allow more time")
@@ -90,18 +103,18 @@ class Overran(Expired):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessLimits:
-    """What one process may use."""
+    """The limits of one process."""
 
     memory_bytes: int
-    """What calls may allocate in addition to what the template has allocated."""
+    """Most bytes that a process may allocate in addition to those that the template has allocated."""
     cpu_s: float = 60.0
-    """CPU seconds of one call, however busy the machine is; its handler may allow less by `limit_cpu`."""
+    """Most CPU seconds of one call; the handler may set another limit by `limit_cpu`."""
     max_reply_bytes: int = _MAX_REPLY_BYTES
-    """A process that replies with more has failed."""
+    """Most bytes of a reply; a longer reply counts as a crash of the process."""
 
 
 class LimitedProcesses:
-    """Up to *count* processes that answer calls; nothing is started before the first call."""
+    """Up to *count* processes that answer calls; no process is started before the first call."""
 
     def __init__(
         self,
@@ -112,14 +125,14 @@ class LimitedProcesses:
         count: int = 1,
         niceness: int = DEFAULT_NICENESS,
     ) -> None:
-        """Describe the function and its limits; nothing is started.
+        """Store the function and its limits; no process is started.
 
         Args:
             target: ``module:function``; the function takes *configuration* and returns a `Handler`.
-            limits: What one process may use.
+            limits: The limits of one process.
             configuration: Text for *target*, such as settings in JSON; at most 100 kB.
-            count: Processes that work at the same time; further calls wait for one of them.
-            niceness: Of the processes, above that of this process.
+            count: Most processes that work at the same time; further calls wait until one is free.
+            niceness: Niceness of the processes above that of this process.
         """
         order = {
             "target": target, "configuration": configuration, "limits": [limits.memory_bytes, limits.cpu_s]
@@ -138,25 +151,25 @@ class LimitedProcesses:
     def call(
         self, data: bytes, timeout_s: float, *, near: str = "", charge: Callable[[float], None] | None = None
     ) -> bytes:
-        """Return the handler's reply to *data*; blocks for at most *timeout_s* seconds, and some ms.
+        """Return the handler's reply to *data*; block for at most *timeout_s* seconds and some milliseconds.
 
-        If a process ends that had answered earlier calls, the call is repeated once in a new process, because
-        an earlier call may be the cause.
+        If a process that has answered earlier calls exits, the call is repeated once in a new process,
+        because an earlier call may be the cause.
 
         Args:
-            data: What the handler gets.
-            timeout_s: Bounds the wait for a process and the work.
-            near: A free process that answered a call with the same text lately is preferred: it may have
-                cached what this call needs.
-            charge: Gets the CPU seconds that the call took, once for each process that worked on it.
+            data: The bytes that the handler receives.
+            timeout_s: Longest time in seconds for the wait for a free process and the work together.
+            near: A key of the data that the call needs.  A free process that lately worked on a call with the
+                same key is preferred, because it may have cached these data.
+            charge: Called with the CPU seconds that the call took, once for each process that worked on it.
 
         Raises:
             Crashed: *data* ended the process by a limit or a signal, which the message names.
             Overran: *timeout_s* passed during the work, and the process was killed.
-            Busy: *timeout_s* passed before a process was free or had been started.
+            Busy: *timeout_s* passed before a process was free or started.
             WorkerLost: The processes cannot be started, or were closed; *data* is not the cause.
-            InternalError: The handler raised an exception that is none of the platform's.
-            RsePfError: What the handler raised.
+            InternalError: The handler raised an exception that is no `RsePfError`.
+            RsePfError: The error that the handler raised.
         """
         until = time.monotonic() + timeout_s
         slot = self._free.take(near, until)
@@ -185,20 +198,24 @@ class LimitedProcesses:
             self._free.give(slot)
 
     def pids(self) -> list[int]:
-        """Return the ids of the template, if it runs, and of its processes."""
+        """Return the pids of the template, if it runs, and of its processes."""
         return self._template.pids()
 
     def close(self) -> None:
-        """End the template and all processes; a call that is under way raises WorkerLost."""
+        """Kill the template and all processes; a call that is being answered raises WorkerLost."""
         self._template.close()
         self._free.forget_all()
 
     def _end(self, slot: _Slot, process: _Process) -> tuple[str, float]:
-        """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
+        """Kill *process* unless it has exited; return how it ended, and the CPU seconds of its last call.
+
+        *slot* is free for a new process then.
+        """
         slot.forget()
         return self._template.end(process)
 
     def _crash(self, how: str, cpu_s: float) -> Crashed:
+        """Return the error about a process that ended as *how* says, after *cpu_s* CPU seconds of a call."""
         if how == _NO_MEMORY:
             how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
         elif how == _NO_TIME:
@@ -207,30 +224,31 @@ class LimitedProcesses:
 
 
 class _Process:
-    """One forked process."""
+    """One forked process, and the socket to it."""
 
     def __init__(self, number: int, pid: int, connection: socket.socket) -> None:
         self.number = number
         self.pid = pid
         self.connection = connection
         self.cpu_s = 0.0
-        """CPU seconds at the end of the last call."""
+        """CPU seconds of the process at the end of its last call."""
 
 
 class _Slot:
-    """The place of one process; None until the next call forks it."""
+    """The slot of one process: the process, None until a call forks one, and its latest values of *near*."""
 
     def __init__(self) -> None:
         self.process: _Process | None = None
         self.near: deque[str] = deque(maxlen=_NEAR)
 
     def note(self, near: str) -> None:
-        """Remember that the process worked near this."""
+        """Remember that the process worked on a call with this value of *near*."""
         if near in self.near:
             self.near.remove(near)
         self.near.append(near)
 
     def forget(self) -> None:
+        """Close the socket to the process, so that it exits, and make the slot empty."""
         self.near.clear()
         if self.process is not None:
             self.process.connection.close()
@@ -238,14 +256,21 @@ class _Slot:
 
 
 class _FreeSlots:
-    """The places where no call is worked on."""
+    """The slots whose processes work on no call."""
 
     def __init__(self, count: int) -> None:
         self._slots = [_Slot() for _ in range(count)]
         self._changed = threading.Condition()
 
     def take(self, near: str, until: float) -> _Slot:
-        """Return the one that was near last, else the one that was near to least; raises Busy at *until*."""
+        """Wait for a free slot and take it.
+
+        The slot that worked on a call with the same *near* last is preferred, otherwise the slot with the
+        fewest remembered values.
+
+        Raises:
+            Busy: No slot was free until the monotonic time *until*.
+        """
         with self._changed:
             if not self._changed.wait_for(lambda: self._slots, max(0.0, until - time.monotonic())):
                 raise _busy_error("no process was free in time")
@@ -266,7 +291,7 @@ class _FreeSlots:
 
 
 class _ProcessEnded(Exception):
-    """The process closed its socket, or broke the rules for the reason that is given."""
+    """A process closed its socket, or replied against the rules, which *reason* explains."""
 
     def __init__(self, reason: str = "") -> None:
         super().__init__(reason)
@@ -274,7 +299,10 @@ class _ProcessEnded(Exception):
 
 
 class _Template:
-    """The fork server as its owner sees it: started by the first fork, replaced when it ended."""
+    """The fork server, as the process that uses it sees it.
+
+    It is started for the first fork, and again for the next fork after it has ended.
+    """
 
     def __init__(self, order: dict[str, Any], niceness: int) -> None:
         self._order = order
@@ -287,25 +315,25 @@ class _Template:
         self._is_ready = False
         self._is_closed = False
         self._number = 0
-        """Of the last fork, of all fork servers."""
+        """Number of the latest fork; a fork server that replaces another one continues the numbers."""
         self._forked: dict[int, int] = {}
-        """The pids of the forks of this server, by number."""
+        """The pids of the forks of the present fork server, by number."""
         self._ends: dict[int, tuple[str, float]] = {}
-        """How forks ended, and their CPU seconds, by number."""
+        """How reported forks ended, and their CPU seconds, by number."""
 
     def has(self, process: _Process) -> bool:
-        """Return whether *process* was forked by the server that runs now."""
+        """Return whether *process* was forked by the present fork server and was not ended."""
         return process.number in self._forked
 
     def pids(self) -> list[int]:
         return ([self._server.pid] if self._server is not None else []) + sorted(self._forked.values())
 
     def fork(self, until: float) -> _Process:
-        """Return a new process.
+        """Fork and return a new process.
 
         Raises:
-            Busy: The fork server was not ready in time; it goes on starting.
-            WorkerLost: It cannot start, or was closed.
+            Busy: The fork server was not ready at the monotonic time *until*; it continues to start.
+            WorkerLost: The fork server cannot start, has ended, or was closed.
         """
         with self._hold_lock(until):
             if self._is_closed:
@@ -327,7 +355,11 @@ class _Template:
             return _Process(number, self._forked[number], ours)
 
     def end(self, process: _Process) -> tuple[str, float]:
-        """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
+        """Kill *process* unless it has exited; return how it ended, and the CPU seconds of its last call.
+
+        Raises:
+            WorkerLost: The fork server has ended, and *process* with it.
+        """
         number = process.number
         with self._lock:
             if self._server is None or not self.has(process):
@@ -378,7 +410,7 @@ class _Template:
             self._lose()
 
     def _take_report(self, server: Child) -> None:
-        """Take one report; raises WorkerLost if the fork server has ended or does not answer."""
+        """Receive one report of the fork server; raises WorkerLost if it has ended or does not answer."""
         try:
             report, handles = read_packet(server.connection)
         except TimeoutError:
@@ -393,11 +425,12 @@ class _Template:
             self._ends[report["id"]] = report["how"], report["cpu_s"]
 
     def _lose(self) -> NoReturn:
+        """Stop the fork server, which does not answer, and raise WorkerLost."""
         self._stop()
         raise WorkerLost("the template of the processes ended", hint="try again")
 
     def _stop(self) -> None:
-        """End the fork server, and with it every process, which dies with its parent."""
+        """Kill the fork server; Linux then kills all its forks."""
         if self._server is not None:
             self._server.kill()
         self._server = None
@@ -411,7 +444,14 @@ def _busy_error(why: str) -> Busy:
 
 
 def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int) -> bytes:
-    """Send *data* and return the reply; raises TimeoutError, `_ProcessEnded` or what the process refused."""
+    """Send *data* to *process* and return its reply.
+
+    Raises:
+        TimeoutError: The monotonic time *until* passed.
+        _ProcessEnded: The process exited, or its reply is longer than *max_reply_bytes*.
+        InternalError: The handler raised an exception that is no `RsePfError`.
+        RsePfError: The error that the handler raised.
+    """
     connection = process.connection
     try:
         connection.settimeout(_left_s(until))
@@ -434,6 +474,7 @@ def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int
 
 
 def _receive(connection: socket.socket, size: int, until: float) -> bytes:
+    """Return the next *size* bytes; raises TimeoutError at *until*, `_ProcessEnded` if there are fewer."""
     received = receive_bytes(connection, size, until)
     if len(received) < size:
         raise _ProcessEnded
@@ -441,18 +482,19 @@ def _receive(connection: socket.socket, size: int, until: float) -> bytes:
 
 
 def _left_s(until: float) -> float:
+    """Return the seconds until the monotonic time *until*; raises TimeoutError if it has passed."""
     left_s = until - time.monotonic()
     if left_s <= 0:
         raise TimeoutError
     return left_s
 
 
-# --- the fork server ------------------------------------------------------------------------------------
+# --- functions that run in the fork server and in its forks ---------------------------------------------
 
 
-def run(owner: socket.socket) -> None:
-    """Fork processes as the *owner* orders, until it is gone."""
-    order, _ = read_packet(owner)
+def run(parent: socket.socket) -> None:
+    """Run as the fork server: make the handler, and fork processes as *parent* orders, until it exits."""
+    order, _ = read_packet(parent)
     if order is None:
         return
     memory_bytes, cpu_s = order["limits"]
@@ -462,16 +504,16 @@ def run(owner: socket.socket) -> None:
     def fork(number: int, descriptors: list[int]) -> int:
         pid = os.fork()
         if pid == 0:
-            _work(owner, handler, memory_bytes, cpu_s, socket.socket(fileno=descriptors[0]))
+            _work(parent, handler, memory_bytes, cpu_s, socket.socket(fileno=descriptors[0]))
         return pid
 
-    serve_forks(owner, ForkPlan(fork=fork, keeps_ended=True))
+    serve_forks(parent, ForkPlan(fork=fork, keeps_ended=True))
 
 
 def _work(
-    owner: socket.socket, handler: Handler, memory_bytes: int, cpu_s: float, connection: socket.socket
+    parent: socket.socket, handler: Handler, memory_bytes: int, cpu_s: float, connection: socket.socket
 ) -> NoReturn:
-    """Answer calls until the connection ends; never return."""
+    """Answer calls in a fork until *connection* is closed, then exit; never return."""
     try:
         template = os.getppid()
         close_other_descriptors(connection.fileno())
@@ -489,12 +531,12 @@ def _work(
 
 
 def limit_cpu(cpu_s: float) -> None:
-    """End this process after *cpu_s* more seconds of CPU time unless it answers before; 0: never."""
+    """Have this process killed after *cpu_s* more seconds of CPU time, unless it answers before; 0: never."""
     signal.setitimer(signal.ITIMER_PROF, cpu_s)
 
 
 def _silence_libraries() -> None:
-    """Drop what native code prints, which the bytes of a call may choose; a traceback goes to the log."""
+    """Drop text that native code prints, which the bytes of a call may choose; keep tracebacks of Python."""
     sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -503,9 +545,9 @@ def _silence_libraries() -> None:
 
 
 def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
-    """Answer one call; return False at the end of the connection.
+    """Answer one call; return False if the connection is closed.
 
-    A call that uses more than *cpu_s* of CPU time ends this process.
+    A call that uses more than *cpu_s* seconds of CPU time ends this process.
     """
     header = connection.recv(_LENGTH.size, socket.MSG_WAITALL)
     if len(header) < _LENGTH.size:

@@ -19,21 +19,30 @@ __all__ = [
     "raise_descriptor_limit", "resident_bytes", "run_as_batch", "set_process_name",
 ]  # fmt: skip
 
-PR_SET_DUMPABLE, PR_SET_SECCOMP, PR_CAPBSET_DROP = 4, 22, 24
-PR_SET_CHILD_SUBREAPER, PR_SET_NO_NEW_PRIVS = 36, 38
-_PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
+# Options of prctl(2), from <linux/prctl.h>.
+PR_SET_DUMPABLE = 4
+PR_SET_SECCOMP = 22
+PR_CAPBSET_DROP = 24
+PR_SET_CHILD_SUBREAPER = 36
+PR_SET_NO_NEW_PRIVS = 38
+_PR_SET_PDEATHSIG = 1
+_PR_SET_NAME = 15
 _PRCTL = ctypes.CDLL(None, use_errno=True).prctl
-"""Looked up once, at import: a child that was just forked may not take locks."""
+"""The function prctl(2).  It is looked up once, at import, because a process that was just forked must not
+take the locks that a look-up takes."""
 
 
 def prctl(option: int, *arguments: int | bytes | ctypes.Structure) -> int:
-    """Call prctl(2) and return its result, -1 after an error; `ctypes.get_errno` says which."""
+    """Call prctl(2) and return its result; -1 after an error, whose errno `ctypes.get_errno` returns."""
     result: int = _PRCTL(option, *arguments, *[0] * (4 - len(arguments)))
     return result
 
 
 def die_with_parent(parent: int | None = None) -> bool:
-    """Have Linux kill this process when its parent's thread ends; False if *parent* has ended already."""
+    """Have Linux kill this process when the thread that started it ends.
+
+    Returns False if the process *parent* has exited already; with None this is not checked.
+    """
     prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     return parent is None or os.getppid() == parent
 
@@ -51,15 +60,15 @@ def raise_descriptor_limit() -> None:
 
 
 def be_killed_first() -> None:
-    """Have Linux end this process before others when the memory of the machine is short."""
+    """Have Linux kill this process before others when the memory of the machine is short."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
 def limit_memory(memory_bytes: int, *, beyond_now: bool = False) -> None:
-    """Limit what this process may allocate, and forbid core files.
+    """Limit the memory that this process may allocate to *memory_bytes*, and forbid core files.
 
-    With *beyond_now* the limit applies to what is allocated from now on.
+    With *beyond_now*, the memory that it has allocated already is not counted.
     """
     if beyond_now:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5])
@@ -69,7 +78,7 @@ def limit_memory(memory_bytes: int, *, beyond_now: bool = False) -> None:
 
 
 def close_other_descriptors(keep: int) -> None:
-    """Close every file that a parent left open, but *keep* and the standard ones."""
+    """Close all file descriptors that were inherited, except *keep*, standard input, output and error."""
     os.closerange(3, keep)
     os.closerange(max(3, keep + 1), 1 << 16)
 
@@ -84,13 +93,13 @@ def cpu_seconds(pid: int) -> float:
 
 
 def disk_free_percent(folder: str = ".") -> float:
-    """Return the free share of the file system of *folder*; what only root may still use is not free."""
+    """Return how much of the file system of *folder* is free, in percent, without what only root may use."""
     disk = os.statvfs(folder)
     return 100.0 * disk.f_bavail / max(1, disk.f_blocks)
 
 
 def resident_bytes(pid: int) -> int:
-    """Return the resident memory of *pid*, 0 if it has exited."""
+    """Return the resident memory of the process *pid* in bytes, 0 if it has exited."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     except OSError:
@@ -99,15 +108,15 @@ def resident_bytes(pid: int) -> int:
 
 
 def page_table_bytes(pid: int) -> int:
-    """Return the memory that the kernel needs for the page tables of *pid*, 0 if it has exited."""
+    """Return the bytes of the page tables of the process *pid* in the kernel, 0 if it has exited."""
     return 1024 * _kilobytes(f"/proc/{pid}/status", "VmPTE")
 
 
 def proportional_bytes(pid: int) -> int:
-    """Return the memory that Linux charges to *pid*: its pages, shared ones in part, swap and page tables.
+    """Return the bytes of memory of the process *pid*: its pages, its swap and its page tables.
 
-    Of a process that this user may not look into, shared pages count in full and files do not.  0 if it
-    has exited.
+    A page that several processes share counts in proportion.  If this user may not read that of *pid*, shared
+    pages count in full, and pages of files do not count.  Returns 0 if the process has exited.
     """
     try:
         pages = _kilobytes(f"/proc/{pid}/smaps_rollup", "Pss", "SwapPss")
@@ -117,9 +126,11 @@ def proportional_bytes(pid: int) -> int:
 
 
 def run_as_batch(pid: int, nice: int) -> None:
-    """Make *pid* wait for a processor rather than take one from a running process, with niceness *nice*.
+    """Set the scheduling policy of the process *pid* to SCHED_BATCH, and its niceness to *nice*.
 
-    Threads that it starts later inherit both.  The niceness leaves it a share of a machine that is full.
+    With this policy it waits for a processor rather than take one from a running process.  The niceness
+    decides which part of a busy machine it gets; it is never lowered below the present one.  Threads that the
+    process starts later inherit both.  Nothing happens if the process has exited.
     """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
@@ -128,7 +139,11 @@ def run_as_batch(pid: int, nice: int) -> None:
 
 
 def _kilobytes(file: str, *names: str) -> int:
-    """Return the sum of the lines *names* of a file in procfs, 0 if its process has exited."""
+    """Return the sum (kB) of the lines *names* of the procfs file *file*, 0 if its process has exited.
+
+    Raises:
+        PermissionError: This user may not read the file.
+    """
     try:
         lines = Path(file).read_text().splitlines()
     except PermissionError:

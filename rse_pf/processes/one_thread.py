@@ -1,7 +1,7 @@
-"""The environment of a process whose numbers must be the same in every process: one thread of BLAS.
+"""Environment variables with which BLAS uses one thread, so that results are equal in every process.
 
-A product of large matrices that BLAS shares among threads is summed in another order, and differs in the last
-bits from that of one thread.
+If BLAS computes a product of large matrices by several threads, the sums are formed in another order than by
+one thread, so the results differ in their last bits.
 """
 
 from __future__ import annotations
@@ -14,4 +14,4 @@ __all__ = ["ONE_THREAD"]
 ONE_THREAD: Mapping[str, str] = MappingProxyType(
     dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 )
-"""Environment variables; they count only if they are set before numpy is imported."""
+"""The environment variables; they have an effect only if they are set before numpy is imported."""

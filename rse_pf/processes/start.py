@@ -1,11 +1,11 @@
-"""Start a child process, and end it.
+"""Start a child process, and end it:
 
     child = start_child(ChildPlan(target="rse_pf.server.jobs.process:run", name="rse-pf job", nice=10))
     child.say({"service": "map-optimise"})
     child.kill()
 
-A child is asked to end by an order, or by the end of its socket; it ignores the signals of a terminal.  What
-does not end is killed, and what was killed is reaped.
+A child exits after a message that asks for it, or when its parent closes the socket; it ignores the signals
+of a terminal.  A child that does not exit is killed, and each child is reaped.
 """
 
 from __future__ import annotations
@@ -30,28 +30,32 @@ __all__ = ["Child", "ChildPlan", "how_ended", "start_child"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChildPlan:
-    """What a child runs, and what it may use.  It holds no secret: other users may read it."""
+    """What a child process runs, and what it may use.
+
+    A plan must hold no secret: it is part of the command line, which other users can read.
+    """
 
     target: str
-    """``module:function``; the function takes the socket to the parent, and the child ends with it."""
+    """``module:function``; the function takes the socket to the parent.  The child exits when it returns."""
     name: str
-    """The name that top shows, of at most 15 letters."""
+    """Name of the process that tools like top show, of at most 15 letters."""
     policy: Literal["usual", "batch"] = "usual"
-    """It gets a processor as its parent does, or takes none from who runs."""
+    """Linux scheduling policy: "batch" makes the child wait for a processor rather than take one from a
+    running process."""
     nice: int = 0
-    """Above that of its parent."""
+    """Niceness of the child above that of its parent."""
     import_nice: int = 0
-    """While it imports *target*, above ``nice``."""
+    """Niceness above ``nice`` while the child imports the module of ``target``."""
     memory_bytes: int | None = None
-    """What it may allocate."""
+    """Most bytes of memory that the child may allocate; None is no limit."""
     is_killed_first: bool = False
-    """Whether Linux kills it before others when memory is short."""
+    """Whether Linux kills the child before other processes when the memory of the machine is short."""
     outlives_parent: bool = False
-    """Whether it goes on when the thread that started it has ended; else Linux kills it."""
+    """Whether the child continues after the thread that started it has ended; otherwise Linux kills it."""
 
 
 class Child:
-    """A started process and the socket to it."""
+    """A started child process and the socket to it."""
 
     def __init__(self, process: subprocess.Popen[bytes], connection: socket.socket) -> None:
         self._process = process
@@ -59,27 +63,27 @@ class Child:
         self.pid = process.pid
 
     def say(self, message: Any) -> None:
-        """Send *message*; it is lost if the process has ended, which the next read shows."""
+        """Send *message* to the child; it is lost if the child has exited, which the next read shows."""
         with suppress(OSError):
             self.connection.sendall(encode_message(message))
 
     def exit_code(self) -> int | None:
-        """Return how it ended (negative: by which signal), None while it runs."""
+        """Return the exit code, minus the number of the signal that ended the child, None while it runs."""
         return self._process.poll()
 
     def wait(self) -> int:
-        """Wait for its end and return the exit code."""
+        """Wait until the child exits, and return `exit_code`."""
         return self._process.wait()
 
     def end(self, within_s: float) -> int:
-        """Close the socket, kill it if it has not ended after *within_s*, and return the exit code."""
+        """Close the socket, kill the child if it still runs *within_s* seconds later; return `exit_code`."""
         self.connection.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(within_s)
         return self.kill()
 
     def kill(self) -> int:
-        """Kill it unless it has ended, reap it and return the exit code; negative for a signal."""
+        """Kill the child unless it has exited, close the socket, reap the child and return `exit_code`."""
         self._process.kill()
         self.connection.close()
         return self._process.wait()
@@ -93,17 +97,18 @@ def start_child(
     descriptors: Sequence[int] = (),
     output: int | None = None,
 ) -> Child:
-    """Start a child; its numbers are those of one thread of linear algebra.
+    """Start a child process.
 
     Args:
-        plan: What it runs.
-        environment: Its variables; None for those of this process.
-        kind: Of the socket to it.
-        descriptors: Open files that it inherits in addition to its socket and the standard ones.
-        output: Where standard output and error go; None for those of this process.
+        plan: What the child runs, and what it may use.
+        environment: Its environment variables; None means those of this process and `ONE_THREAD`.
+        kind: Type of the socket between parent and child.
+        descriptors: File descriptors that the child inherits in addition to its socket.
+        output: Descriptor to which the child's standard output and standard error go; None means those of
+            this process.
 
     Raises:
-        OSError: The machine has no process, memory or descriptor left.
+        OSError: The system cannot start a process, for example because memory or descriptors are used up.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, kind)
     parent = 0 if plan.outlives_parent else os.getpid()
@@ -122,13 +127,13 @@ def start_child(
     if plan.policy == "batch":
         run_as_batch(process.pid, nice)
     elif plan.nice:
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the child has exited already
             os.setpriority(os.PRIO_PROCESS, process.pid, nice)
     return Child(process, ours)
 
 
 def how_ended(code: int) -> str:
-    """Describe an exit code as part of a sentence."""
+    """Return text for an exit code as in `Child.exit_code`: ``exit code 1`` or ``signal SIGKILL``."""
     if code >= 0:
         return f"exit code {code}"
     return f"signal {signal.Signals(-code).name if -code in set(signal.Signals) else -code}"

@@ -68,9 +68,7 @@ _DRAWN_DIVISOR = 64  # a process draws 1/64 of the bytes left, so that several c
 _DRAWN_S = 5.0  # seconds after which drawn bytes expire, so that a process that exited holds none for long
 _WRITTEN_S = 15.0  # longest time in seconds from the drawing of an object's bytes to the end of its writing
 _MAX_SWAPS = 50  # attempts to change an account that other processes change at the same time
-_DISK_SHARE_S = (
-    1.0  # seconds for which an equal part of the disk is remembered: all tenants are counted for it
-)
+_DISK_SHARE_S = 1.0  # seconds for which an equal part of the disk is remembered, which counts all tenants
 _RESERVE_SHARE = 0.1
 """Free fraction of the disk below which a tenant that stores more than an equal part is refused."""
 _NEVER = float("-inf")
