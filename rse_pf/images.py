@@ -39,10 +39,10 @@ _EXTRA_ROW_BYTES = 4  # the filter bytes and the last bits of a row in all seven
 _MAX_SCANS = 20
 """Most scans of a JPEG.  Decoding a scan of a progressive JPEG costs time for the whole image, even if the
 scan has few bytes; cameras write ten scans."""
-_FRAMES = range(0xC0, 0xD0)  # markers of the JPEG segments that state the size of the image, and of others
-_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # markers in `_FRAMES` of segments that state no size
+_FRAMES = range(0xC0, 0xD0)  # second bytes of JPEG markers; segments with these state the size of the image
+_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # exceptions in `_FRAMES`: segments with these state no size
 _DECODED_FRAMES = (0xC0, 0xC1, 0xC2)
-"""Markers of the JPEG codings that are accepted: baseline, extended and progressive Huffman coding."""
+"""Those of `_FRAMES` that are accepted: baseline, extended and progressive Huffman coding."""
 _SCAN = b"\xff\xda"  # marker at the start of each scan of a JPEG
 _END_OF_JPEG = b"\xff\xd9"  # marker at the end of a JPEG
 _END_OF_PNG = b"IEND"  # name of the last chunk of a PNG
@@ -117,7 +117,7 @@ def photo_size(data: bytes) -> tuple[int, int]:
     else:
         raise BadRequest("the image is neither JPEG nor PNG", hint=_HINT)
     if not width or not height:
-        raise BadRequest(f"an image of {width}x{height} px shows nothing", hint=_HINT)
+        raise BadRequest(f"an image of {width}x{height} px has no pixels", hint=_HINT)
     if width * height > MAX_PHOTO_PIXELS:
         raise LimitExceeded(
             f"an image of {width}x{height} px is above {MAX_PHOTO_PIXELS} pixels",

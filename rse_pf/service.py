@@ -104,7 +104,8 @@ class Registry:
         """
         if limited and (cheap or kind != "stateless"):
             raise ConfigurationError(
-                f"service {name!r} is limited, but cheap or not stateless", hint="choose one of them"
+                f"service {name!r} is limited, but cheap or not stateless",
+                hint="leave out limited, or make the service stateless and not cheap",
             )
 
         def register(function: Function) -> Function:
@@ -182,7 +183,8 @@ def dispatch(
             exited = RuntimeError(f"the service called exit({error})")
             on_defect(command, error if isinstance(error, Exception) else exited)
         defect = InternalError(
-            f"service {command.service!r} failed", hint="see the server's log under this trace id"
+            f"service {command.service!r} failed",
+            hint="the server's log has the traceback under the trace id of this command",
         )
         return failure_of(defect, command, server=server)
     ended = clock()

@@ -148,7 +148,7 @@ def json_line(value: Any, encode: Callable[[Any], bytes]) -> bytes:
     """
     try:
         line = encode(value)
-    except UnicodeEncodeError:  # a lone surrogate
+    except UnicodeEncodeError:  # *value* has a lone surrogate, which UTF-8 cannot encode
         return json.dumps(value, default=str).encode()
     if line.isascii() and b"\x7f" not in line:
         return line
@@ -174,7 +174,7 @@ def _is_hidden(letter: str) -> bool:
 def _write(stream: TextIO, text: str) -> None:
     try:
         stream.write(text)
-    except UnicodeEncodeError:  # a terminal that has no such letters
+    except UnicodeEncodeError:  # the terminal's encoding lacks a letter, which is written as an escape
         encoding = stream.encoding or "ascii"
         stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
     stream.flush()

@@ -181,7 +181,7 @@ class SigningKey:
         check_tenant(tenant)
         check_scopes(scopes)
         if not 0 < len(token_id) <= 64:
-            raise UsageError("a token id has 1 to 64 characters", hint="leave it to rse-pf token issue")
+            raise UsageError("a token id has 1 to 64 characters", hint="let rse-pf token issue choose it")
         ttl_s = settings.token_ttl_s if ttl_s is None else ttl_s
         if not 0 < ttl_s <= settings.token_ttl_s:
             raise UsageError(

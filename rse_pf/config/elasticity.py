@@ -64,8 +64,8 @@ def check_elasticity(scaling: Mapping[str, Any], cloud: Mapping[str, Any]) -> No
     if scaling["underused_s"] and scaling["busy_cpu_percent"] < 2 * UNDERUSED_CPU_PERCENT:
         raise SettingsError(
             f"scaling.busy_cpu_percent = {scaling['busy_cpu_percent']:g} is less than twice the "
-            f"{UNDERUSED_CPU_PERCENT:g} % below which a server is spared; one of two servers that leaves "
-            "would make the other one busy",
+            f"{UNDERUSED_CPU_PERCENT:g} % below which a server is removed; if one of two servers were "
+            "removed, the other one would be busy",
             hint=f"raise scaling.busy_cpu_percent {WHERE}, or set scaling.underused_s to 0",
         )
     zone_named(scaling["time_zone"])

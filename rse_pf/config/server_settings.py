@@ -47,7 +47,8 @@ def server_settings(settings: PlatformSettings) -> dict[str, dict[str, Any]]:
         }
         for group in dataclasses.fields(PlatformSettings)
     }
-    chosen["burst"]["url"] = settings.burst.url or BURST_PATH  # the function is behind the load balancer
+    # Without burst.url, robots send commands to the load balancer, which passes them to the Lambda function.
+    chosen["burst"]["url"] = settings.burst.url or BURST_PATH
     # No server reads scaling.idle_s, but `PlatformSettings` accepts only a multiple of scaling.period_s.
     chosen["scaling"]["idle_s"] = settings.scaling.period_s * 60
     PlatformSettings.from_dict(chosen)

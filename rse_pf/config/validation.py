@@ -157,7 +157,7 @@ def check_cidr(name: str, cidr: str) -> None:
     try:
         if _PREFIX.search(cidr) is None:
             raise ValueError
-        ipaddress.IPv4Network(cidr, strict=False)  # AWS clears the bits behind the prefix
+        ipaddress.IPv4Network(cidr, strict=False)  # AWS accepts bits after the prefix, and clears them
     except ValueError:
         raise SettingsError(
             f"{name} = {_shown(cidr)} is no range of IPv4 addresses",

@@ -34,13 +34,14 @@ MAX_HEADERS = 64  # most headers of a request: browsers and load balancers send 
 # Bytes for the sizes and line ends of the chunks of a chunked body, in addition to those that `FRAMING_SHIFT`
 # allows.  A body of many tiny chunks would cost much CPU time.
 MAX_FRAMING_BYTES = 4096
-FRAMING_SHIFT = 3  # these bytes may also be an eighth (2**-3) of the data in the chunks
-PARSED_AT_ONCE_BYTES = 16384  # bytes of a chunked body between two checks of these bytes
+FRAMING_SHIFT = 3  # binary exponent: these bytes may also be 2**-3, an eighth, of the data in chunks
+PARSED_AT_ONCE_BYTES = 16384  # received bytes of a chunked body between two checks of `MAX_FRAMING_BYTES`
 UNSENT_HIGH_BYTES = 1 << 19  # unsent bytes of a reply above which the application waits for the client
 UNSENT_LOW_BYTES = 1 << 18  # unsent bytes of a reply down to which the application waits then
 _END_OF_HEAD = b"\r\n\r\n"
+# A whole request head that is accepted: the form of RFC 9112 without its obsolete variants.
 _HEAD = re.compile(
-    rb"[A-Z]{1,16} /[!\"$-~]* HTTP/1\.1\r\n"  # no fragment: readers differ in what they do with "#"
+    rb"[A-Z]{1,16} /[!\"$-~]* HTTP/1\.1\r\n"  # no fragment: HTTP implementations treat "#" differently
     rb"(?:[-!#$%&'*+.^_`|~0-9A-Za-z]+:[\t -~\x80-\xff]*\r\n){1," + b"%d" % MAX_HEADERS + rb"}\r\n"
 )
 
@@ -136,7 +137,7 @@ class OneRequestProtocol(HttpToolsProtocol):
             self._head = data
             if len(data) >= MAX_HEAD_BYTES or not data[:1].isupper():
                 self._refuse()
-            else:  # the time for the whole head begins with its first byte
+            else:  # the first byte of a head: the connection is not idle, and has `seconds` for the head
                 self._idle.leave(self)
                 self._silent.enter(self, self.transport.abort)
             return
@@ -155,14 +156,14 @@ class OneRequestProtocol(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """Begin a request; raise ValueError if the previous one is not answered yet."""
         if self._is_in_request():
-            raise ValueError("a request came before the reply to the one before")
+            raise ValueError("a request came before the reply to the previous one")
         super().on_message_begin()
         self._has_head = False
 
     def on_header(self, name: bytes, value: bytes) -> None:
         """Add a header of the head; raise ValueError for a trailer (a header after a chunked body)."""
         if self._has_head:
-            raise ValueError("a trailer")
+            raise ValueError("a header follows a chunked body")
         super().on_header(name, value.rstrip(b" \t"))  # llhttp does not remove these spaces
 
     def on_headers_complete(self) -> None:
@@ -174,9 +175,9 @@ class OneRequestProtocol(HttpToolsProtocol):
         lengths = [each for each in self.headers if each[0] in (b"content-length", b"transfer-encoding")]
         self._is_chunked = [each[0] for each in lengths] == [b"transfer-encoding"]
         if hosts != 1 or len(lengths) > 1 or self.parser.should_upgrade():
-            raise ValueError("a head with two meanings")
+            raise ValueError("the head has no or several hosts, several lengths of the body, or an upgrade")
         if self._is_chunked and lengths[0][1].lower() != b"chunked":
-            raise ValueError("an unknown coding")
+            raise ValueError("the transfer coding of the body is not chunked")
         self._has_head, self._framing_bytes_left = True, MAX_FRAMING_BYTES
         super().on_headers_complete()
 
@@ -196,7 +197,7 @@ class OneRequestProtocol(HttpToolsProtocol):
             self.flow.resume_reading()
             self._idle.enter(self, self.transport.close)
 
-    # -------------------------------------------------------------------------------------------------
+    # --- private methods: parse a body, refuse a request, run the application ----------------------------
 
     def _is_in_request(self) -> bool:
         """Return whether a request has begun whose reply is not complete."""

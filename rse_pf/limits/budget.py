@@ -432,6 +432,7 @@ _LENGTHS = {
     0xDA: (2, 3), 0xDB: (4, 5),
 }  # fmt: skip
 
+# By first byte of a MessagePack value: how far the next value is, see `_steps`.
 _STEPS = _steps()
 # By first byte of a list or map: the number of values that it counts as, less one.
 _MORE = tuple((MAP_VALUES if k < 0x90 or k >= 0xDE else LIST_VALUES) - 1 for k in range(256))

@@ -38,7 +38,7 @@ class FairQueue(Generic[Item]):
         self._max_per_robot = max_running_per_robot
         self._max_per_tenant = max_running_per_tenant
         self._tenants: OrderedDict[str, OrderedDict[RobotId, deque[Item]]] = OrderedDict()
-        self._running: Counter[Hashable] = Counter()  # by robot and by the name of the tenant
+        self._running: Counter[Hashable] = Counter()  # running items by robot, and by tenant
         self._count = 0
 
     def __len__(self) -> int:

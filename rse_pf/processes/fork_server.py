@@ -131,7 +131,7 @@ class _Forks:
     def run(self, ready: dict[str, Any]) -> None:
         if not self._plan.keeps_ended:
             prctl(PR_SET_CHILD_SUBREAPER, 1)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # descriptors of processes report their end
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # pidfds report the exits of forks instead
         gc.collect()
         gc.freeze()
         self._report(event="ready", **ready)

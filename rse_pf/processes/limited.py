@@ -220,7 +220,7 @@ class LimitedProcesses:
             how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
         elif how == _NO_TIME:
             how = f"it used {cpu_s:.1f} s of CPU time, which is more than it may"
-        return Crashed(f"the process that worked on this ended: {how}", hint="send less at once")
+        return Crashed(f"the process that worked on this request ended: {how}", hint="send less data at once")
 
 
 class _Process:
@@ -337,7 +337,7 @@ class _Template:
         """
         with self._hold_lock(until):
             if self._is_closed:
-                raise WorkerLost("the processes were closed", hint="try again elsewhere")
+                raise WorkerLost("the processes for this work were closed", hint="try again elsewhere")
             try:
                 server = self._server = self._server or start_fork_server(self._plan, self._order)
                 self._wait_until_ready(server, until)
@@ -363,7 +363,7 @@ class _Template:
         number = process.number
         with self._lock:
             if self._server is None or not self.has(process):
-                raise WorkerLost("the process ended with its template", hint="try again")
+                raise WorkerLost("the process ended, because its template ended", hint="try again")
             self._ask(self._server, "end", number)
             while number not in self._ends:
                 self._take_report(self._server)
@@ -398,7 +398,8 @@ class _Template:
         if report is None:
             self._stop()
             raise WorkerLost(
-                "the process cannot be started", hint="tell the operator; the server's log has it"
+                "the process cannot be started",
+                hint="report it to the operator; the server's log has the cause",
             )
         server.connection.settimeout(_ORDER_TIMEOUT_S)
         self._is_ready = True
@@ -427,7 +428,7 @@ class _Template:
     def _lose(self) -> NoReturn:
         """Stop the fork server, which does not answer, and raise WorkerLost."""
         self._stop()
-        raise WorkerLost("the template of the processes ended", hint="try again")
+        raise WorkerLost("the template from which processes are forked ended", hint="try again")
 
     def _stop(self) -> None:
         """Kill the fork server; Linux then kills all its forks."""
@@ -470,7 +471,7 @@ def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int
     if kind == _REFUSED:
         code, message, hint, retry_after_ms = json.loads(reply)
         raise error_from_code(code, message, hint=hint, retry_after_ms=retry_after_ms)
-    raise InternalError("the work failed", hint="the server's log has it")
+    raise InternalError("the work raised an unexpected error", hint="the server's log has the traceback")
 
 
 def _receive(connection: socket.socket, size: int, until: float) -> bytes:

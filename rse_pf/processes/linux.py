@@ -20,13 +20,13 @@ __all__ = [
 ]  # fmt: skip
 
 # Options of prctl(2), from <linux/prctl.h>.
-PR_SET_DUMPABLE = 4
-PR_SET_SECCOMP = 22
-PR_CAPBSET_DROP = 24
-PR_SET_CHILD_SUBREAPER = 36
-PR_SET_NO_NEW_PRIVS = 38
-_PR_SET_PDEATHSIG = 1
-_PR_SET_NAME = 15
+PR_SET_DUMPABLE = 4  # whether other processes of the user may read the memory
+PR_SET_SECCOMP = 22  # installs a filter of system calls
+PR_CAPBSET_DROP = 24  # drops a capability for ever
+PR_SET_CHILD_SUBREAPER = 36  # orphaned descendants become children of this process
+PR_SET_NO_NEW_PRIVS = 38  # execve(2) never gives this process more privileges
+_PR_SET_PDEATHSIG = 1  # signal for this process when the thread that started it ends
+_PR_SET_NAME = 15  # name of this thread; of the main thread it is that of the process
 _PRCTL = ctypes.CDLL(None, use_errno=True).prctl
 """The function prctl(2).  It is looked up once, at import, because a process that was just forked must not
 take the locks that a look-up takes."""

@@ -43,7 +43,7 @@ __all__ = [
 _Names = list[str]  # a name for the type in classes that have a method "list"
 _SHARD = "+"  # begins the name of each subfolder for objects of a robot; two digits of their digests follow
 _LOCK = ".lock-"  # begins the names of lock files
-_DIGEST = re.compile(r"[0-9a-f]{64}")
+_DIGEST = re.compile(r"[0-9a-f]{64}")  # a sha256 in hex, the last segment of the name of a robot's object
 _WRITE_TRIES = 8  # attempts to write an object whose folder other processes remove at the same time
 # Nanoseconds after the last change of a folder in which it may change again without a newer time stamp, so
 # that its usage is not remembered.
@@ -390,7 +390,7 @@ class DirectoryStore:
                     with contextlib.suppress(FileNotFoundError):
                         os.unlink(each)
             if folder != self._root and not os.path.basename(folder).startswith(_SHARD):
-                with contextlib.suppress(OSError):  # it is not empty
+                with contextlib.suppress(OSError):  # the folder is not empty
                     os.rmdir(folder)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
@@ -587,7 +587,10 @@ def _locked(path: str, flags: int, size: int) -> Iterator[int]:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if not _is_at(path, handle) or os.fstat(handle).st_size != size:
-            raise Conflict("the upload was changed meanwhile", hint="ask for its progress")
+            raise Conflict(
+                f"the upload does not have {size} bytes, or was changed meanwhile",
+                hint="ask the server how many bytes it has, and continue there",
+            )
         yield handle
     except BlockingIOError as error:
         raise Busy("another server writes this upload", hint="retry later", retry_after_ms=1000.0) from error

@@ -71,7 +71,7 @@ _MAX_SWAPS = 50  # attempts to change an account that other processes change at 
 _DISK_SHARE_S = 1.0  # seconds for which an equal part of the disk is remembered, which counts all tenants
 _RESERVE_SHARE = 0.1
 """Free fraction of the disk below which a tenant that stores more than an equal part is refused."""
-_NEVER = float("-inf")
+_NEVER = float("-inf")  # the time of an event that has not happened yet
 _OF_TENANT = ("objects", "maps", "live", "states", "jobs")
 """First segments of the names of objects that are charged to the tenant in the second segment."""
 
@@ -217,7 +217,10 @@ class TenantAccount:
             except Conflict:
                 continue
             return drawn
-        raise Busy(f"the account of tenant {self._tenant!r} changes all the time", retry_after_ms=500.0)
+        raise Busy(
+            f"other processes changed the account of tenant {self._tenant!r} {_MAX_SWAPS} times meanwhile",
+            retry_after_ms=500.0,
+        )
 
     def _read(self) -> bytes | None:
         try:
@@ -252,8 +255,8 @@ class TenantAccount:
         if held + charge + margin <= share:
             return None
         return StoreFull(
-            f"the disk is nearly full, and the tenant {self._tenant!r} holds {held} bytes of its share of "
-            f"{share:.0f}",
+            f"the disk is nearly full, and the tenant {self._tenant!r} stores {held} bytes; an equal part of "
+            f"the disk is {share:.0f}",
             hint="delete objects or maps of this tenant, or use a larger disk",
         )
 
@@ -357,7 +360,7 @@ def _uploads(store: ObjectStore, folder: str, check: Callable[[], None]) -> Usag
     total = Usage()
     for upload in store.folders(f"uploads/{folder}"):
         check()
-        with contextlib.suppress(NotFound):  # it has just been completed
+        with contextlib.suppress(NotFound):  # the upload has just been completed
             total += Usage(1, charge_of(int(store.get(f"uploads/{folder}{upload}/size").split()[0])))
     return total
 
@@ -486,7 +489,7 @@ class Accounts:
             with account.lock:
                 account.writing = _subtract(account.writing, charge)
                 if account.counted_s != counted_s:
-                    account.counted_s = _NEVER  # a count meanwhile may have seen the object, or not
+                    account.counted_s = _NEVER  # a count meanwhile may have included the object, or not
                 elif is_stored:
                     account.stored += charge
 

@@ -91,7 +91,9 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
         raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
     # The sum of squares is finite only if every number is finite; vdot overflows without a warning.
     if not math.isfinite(np.vdot(array, array)):
-        raise BadMessage("an array holds a number that is not finite or out of range", hint="leave it out")
+        raise BadMessage(
+            "an array holds a number that is not finite or out of range", hint="send finite numbers only"
+        )
     return array
 
 

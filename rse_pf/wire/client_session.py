@@ -132,6 +132,7 @@ class RenewalDue:
     """The connection expires soon, with the robot's token: send a fresh one by `ClientSession.renew`."""
 
 
+# What a `ClientSession` reports to its caller.
 Event = (
     RenewalDue
     | Answered
@@ -351,7 +352,7 @@ class ClientSession:
             before.leaving = True
             for pending in self._pending.values():
                 if pending.connection is before and pending.is_long and not pending.cancelled:
-                    pending.connection = None  # the job continues on any server; the old one can close now
+                    pending.connection = None  # any server continues a job, so the old connection can close
         self._send(self.subscriptions.adopt(connection, now), now)
         frames = [frame for frame in self._pending.values() if _is_frame(frame) and frame.connection is None]
         if (
@@ -492,7 +493,9 @@ class ClientSession:
         for identity, pending in waiting:
             command = pending.command
             if self._is_replaced(command):
-                events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
+                events += self._end(
+                    identity, _failure(command, "stale", "a newer frame of the stream replaced this one")
+                )
             elif (busy := self._busy_for_too_long(pending, now)) is not None:
                 events += self._end(identity, busy)
             elif self._may_send(pending, connection, capacity, now):
@@ -598,11 +601,13 @@ class ClientSession:
             return [] if self._retry(pending, answer, now) else self._end(pending.command.id, answer)
         command = pending.command
         if now >= pending.deadline:
-            late = _failure(command, "expired", f"its answer came after {now - pending.submitted:.3f} s")
+            late = _failure(
+                command, "expired", f"the answer came too late, after {now - pending.submitted:.3f} s"
+            )
             return self._end(command.id, late)
         last = self._delivered.get(command.stream, 0)
         if command.stream and not command.keep and command.seq < last:
-            stale = _failure(command, "stale", "a newer answer came first")
+            stale = _failure(command, "stale", "the answer to a newer frame came first")
             return self._end(command.id, stale)
         if not pending.cancelled:
             self._delivered[command.stream] = max(last, command.seq)

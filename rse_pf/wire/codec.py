@@ -52,6 +52,7 @@ SUBPROTOCOLS = {
 
 CODECS = tuple(SUBPROTOCOLS)
 """The names of all codecs."""
+# By WebSocket sub-protocol: the name of its codec.
 _CODEC_NAMES = {protocol: name for name, protocol in SUBPROTOCOLS.items()}
 
 # zlib level of a robot's text messages.  A robot's uplink is slower than its processor: at level 1 a command
@@ -80,6 +81,7 @@ _MAX_FAST_BYTES = 16_384
 _CONTAINERS = frozenset((dict, list, tuple))
 # Returns whether none of some types is in `_CONTAINERS`.
 _is_flat = _CONTAINERS.isdisjoint
+# Types of the messages that robots send.
 _FROM_ROBOT = frozenset(get_args(FromRobot))
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, OverflowError)
 """Exceptions that decoders of msgspec raise for invalid bytes, with their subclasses."""

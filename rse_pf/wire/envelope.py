@@ -23,7 +23,7 @@ from rse_pf.wire.messages import Failure
 
 __all__ = ["Envelope", "encode_refusal", "peek", "undecodable_id"]
 
-# First bytes of a message that are read, at most; id and service are in the first 160.
+# Most bytes at the start of a message in which the id and the service are searched.
 _MAX_PEEKED_BYTES = 512
 # Bytes to which `peek` inflates the start of a message: enough for the longest id and service.
 _INFLATED_BYTES = 160

@@ -159,14 +159,14 @@ class LiveStart(_Value, frozen=True, kw_only=True):
 LiveRequest = KeyframeRequest | LiveRelocalise | LiveMapRequest | LiveForget | LiveStart
 """A request that the map server of a live map answers."""
 # Names of the services of live maps.
-KEYFRAME = "live-keyframe"
-RELOCALISE = "live-relocalise"
-LEAVE = "live-leave"
-SHOW = "live-show"
-PUBLISH = "live-publish"
-STOP = "live-stop"
-FORGET = "live-forget"
-START = "live-start"
+KEYFRAME = "live-keyframe"  # a robot adds a keyframe
+RELOCALISE = "live-relocalise"  # a robot asks for the pose of a keyframe in the map
+LEAVE = "live-leave"  # a robot leaves the map
+SHOW = "live-show"  # returns the state of the map
+PUBLISH = "live-publish"  # stores a version of the map
+STOP = "live-stop"  # ends the map
+FORGET = "live-forget"  # removes what one robot contributed
+START = "live-start"  # begins a map
 LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
     KEYFRAME: KeyframeRequest,
     RELOCALISE: LiveRelocalise,

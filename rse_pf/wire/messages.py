@@ -225,6 +225,7 @@ class Update(_Message, frozen=True, kw_only=True, tag="update"):
     payload: Any = None
 
 
+# A message that robots send, and one that servers send.
 FromRobot = Hello | Command | Ping | Cancel | Renew | Subscribe | Unsubscribe
 FromServer = Welcome | Result | Failure | Move | Pong | Progress | Renewed | Update
 Message = FromRobot | FromServer

@@ -144,6 +144,7 @@ class EndUpdates(msgspec.Struct, frozen=True, gc=False):
     id: int
 
 
+# What the caller of a `ServerSession` has to do.
 Decision = Send | Submit | Withdraw | Renewal | Close | BeginUpdates | EndUpdates
 
 
@@ -268,7 +269,8 @@ class ServerSession:
         """Begin the subscription of *message*, or refuse it; an earlier one with the same id ends."""
         if not self.hears_updates:
             unannounced = BadRequest(
-                f"this connection did not announce the capability {UPDATES}", hint="name it in hello"
+                f"this connection did not announce the capability {UPDATES}",
+                hint="name it in the hello message",
             )
             return [self._send(self._failure(unannounced, identity=message.id))]
         ended: list[Decision] = []
@@ -285,8 +287,8 @@ class ServerSession:
     def _renew(self, token: str, now: float) -> list[Decision]:
         if now < self._next_renewal_s:
             error = Busy(
-                "a fresh token was sent a moment ago",
-                hint="renew once per token",
+                f"a fresh token was sent less than {RENEWAL_PAUSE_S:g} s ago",
+                hint="renew each token once, before it expires",
                 retry_after_ms=1e3 * (self._next_renewal_s - now),
             )
             return [self._send(self._failure(error))]
@@ -309,7 +311,7 @@ class ServerSession:
             return self._close(CLOSE_PROTOCOL, "hello came twice")
         if hello.protocol != PROTOCOL_VERSION:
             error = UnsupportedProtocol(
-                f"protocol {hello.protocol} is not {PROTOCOL_VERSION}",
+                f"the robot has protocol version {hello.protocol}, this server {PROTOCOL_VERSION}",
                 hint="install a matching rse-pf on the robot",
             )
             return [self._send(self._failure(error)), *self._close(CLOSE_UNSUPPORTED, "unsupported protocol")]
