@@ -65,7 +65,11 @@ class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
             raise UsageError(f"{path} is not an enrolment: {str(error)[:150]}", hint=_HINT) from error
 
     def write(self, path: Path) -> None:
-        """Write a new file that only its owner can read; raises UsageError if it exists already."""
+        """Write the enrolment to the new file *path* with the mode 0600.
+
+        Raises:
+            UsageError: The file exists already, or cannot be written.
+        """
         try:
             create_private_file(
                 path, msgspec.json.format(msgspec.json.encode(self), indent=1).decode() + "\n"
@@ -108,5 +112,5 @@ class EnrolmentFile:
         return self.read().token(now_s=self._clock(), token_id=secrets.token_hex(_TOKEN_ID_BYTES))
 
     async def token(self) -> str:
-        """Return what `fresh_token` returns, as the coroutine function that `client_sdk.connect` takes."""
+        """Return `fresh_token`; pass this coroutine function to `client_sdk.connect` as its *token*."""
         return self.fresh_token()

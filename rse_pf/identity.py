@@ -52,7 +52,7 @@ class RobotId(NamedTuple):
     enrolment: str = ""
 
     def __str__(self) -> str:
-        """Return the name as an operator writes it: with the tenant, unless that is the default one."""
+        """Return the name as an operator writes it: ``TENANT/ROBOT``, or ``ROBOT`` in the default tenant."""
         is_plain = self.tenant == DEFAULT_TENANT and "/" not in self.name
         return self.name if is_plain else f"{self.tenant}/{self.name}"
 
@@ -91,6 +91,9 @@ def shown_name(folder: str) -> str:
 
 
 def folders_of(name: str, folders: list[str]) -> list[str]:
-    """Return those `RobotId.folder` in *folders* that belong to robots called *name*, of any enrolment."""
+    """Return those of *folders* (each a `RobotId.folder`) that belong to a robot with this *name*.
+
+    The robots may have different tenants and enrolments.
+    """
     wanted = {name, name_segment(name)}
     return [folder for folder in folders if shown_name(folder) in wanted]

@@ -82,7 +82,7 @@ def aligned(array: npt.NDArray[Any], dtype: type | None = None) -> npt.NDArray[A
 
 
 class Workspace(threading.local):
-    """Scratch memory for calls of the native core: one array in each thread, as large as its largest call."""
+    """Scratch memory for calls of the native core: one array for each thread, which grows when needed."""
 
     _words = np.empty(0, dtype=np.uint64)
 

@@ -37,7 +37,7 @@ _HINT = "remove the file; a new one is made, and robots must be enrolled again"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CertificateWithKey:
-    """A certificate and its private key, both PEM; ``private_key`` is a secret."""
+    """A certificate and its private key, both as PEM texts; ``private_key`` is a secret."""
 
     certificate: str
     private_key: str

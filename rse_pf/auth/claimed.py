@@ -27,13 +27,13 @@ _T = TypeVar("_T", bound=msgspec.Struct)
 
 
 class _Header(msgspec.Struct):
-    """The header of a token that nobody verified."""
+    """The header of a token that was not verified."""
 
     kid: Any = None
 
 
 class _Claimed(msgspec.Struct):
-    """The claims of a token that nobody verified; they may be of any type."""
+    """The claims of a token that was not verified; their values may have any type."""
 
     sub: Any = None
     tenant: Any = None

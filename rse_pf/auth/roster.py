@@ -140,7 +140,7 @@ class Roster(_Value, frozen=True, kw_only=True):
 
 
 class RevokedToken(_Value, frozen=True, kw_only=True):
-    """One token that is refused, with the Unix time at which it expires anyway."""
+    """One refused token; after the Unix time ``expires_s`` the token is expired, and the entry not needed."""
 
     tenant: str
     robot: str

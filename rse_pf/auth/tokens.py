@@ -84,7 +84,7 @@ class Claims(msgspec.Struct, frozen=True, kw_only=True):
     quotas: tuple[tuple[str, float], ...] = ()
 
     def quota(self, name: str) -> float | None:
-        """Return the limit of the quota *name*, one of `rse_pf.auth.roster.QUOTAS`; None if none is set."""
+        """Return the robot's limit for *name*, one of `rse_pf.auth.roster.QUOTAS`; None if none is set."""
         return dict(self.quotas).get(name)
 
 
@@ -145,7 +145,7 @@ class SigningKey:
             raise UsageError("this is not a signing key", hint="make one with rse-pf local") from error
 
     def to_json(self) -> str:
-        """Return the key as a private JWK; keep it secret."""
+        """Return the key as a private JWK, which is a secret."""
         return json.dumps({**self._public_jwk(), "d": _b64(self._private.private_bytes_raw())})
 
     def key_set(self) -> KeySet:

@@ -103,21 +103,21 @@ class SessionSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PnpSettings:
-    """The perspective-n-point service."""
+    """The perspective-n-point service ``pnp``."""
 
     engine: str = setting("native", doc="solver of a command that chooses none; opencv is the paper's, for comparisons", choices=("native", "opencv"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HealthSettings:
-    """When a server counts as healthy."""
+    """When a server counts as unhealthy."""
 
     unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row after which a server is unhealthy", low=2, high=10)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScalingSettings:
-    """When the cloud grows and shrinks."""
+    """When servers are added and removed, and how many there may be."""
 
     busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=20, high=100)
     idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without a command of a robot, and with less than 20 % CPU; commands of synthetic robots, such as the canary, do not count", low=60)
@@ -156,7 +156,7 @@ class DataSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuthSettings:
-    """Robot tokens."""
+    """Tokens of robots: their audience, validity and use."""
 
     audience: str = setting("rse-pf", doc="audience (aud) of the tokens")
     token_ttl_s: int = setting(900, unit="s", doc="longest validity of a robot token", source="RFC 8725; short-lived", low=10, high=900)
@@ -211,7 +211,7 @@ class BatchSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalSettings:
-    """The platform on one machine."""
+    """The platform on one machine: rse-pf local."""
 
     port: int = setting(8700, doc="port of the local load balancer; 0 takes a free one", low=0, high=65535)
     servers: int = setting(2, unit="servers", doc="backend servers at the start", low=1, high=64)

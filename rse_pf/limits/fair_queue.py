@@ -42,7 +42,7 @@ class FairQueue(Generic[Item]):
         self._count = 0
 
     def __len__(self) -> int:
-        """Return how many items wait."""
+        """Return the number of waiting items."""
         return self._count
 
     def __iter__(self) -> Iterator[Item]:
@@ -52,7 +52,7 @@ class FairQueue(Generic[Item]):
                 yield from items
 
     def items_of(self, robot: RobotId) -> deque[Item]:
-        """Return the waiting items of *robot*, first in first; the caller may replace one by another."""
+        """Return the waiting items of *robot* in their order; the caller may replace items in it."""
         robots = self._tenants.get(robot.tenant)
         return deque() if robots is None else robots.get(robot, deque())
 

@@ -235,7 +235,7 @@ class _Process:
 
 
 class _Slot:
-    """The slot of one process: the process, None until a call forks one, and its latest values of *near*."""
+    """The slot of one process: the process (None until a call forks one), and its latest values of *near*."""
 
     def __init__(self) -> None:
         self.process: _Process | None = None
@@ -532,7 +532,10 @@ def _work(
 
 
 def limit_cpu(cpu_s: float) -> None:
-    """Have this process killed after *cpu_s* more seconds of CPU time, unless it answers before; 0: never."""
+    """Set the CPU limit of the present call: after *cpu_s* more CPU seconds, this process is killed.
+
+    0 removes the limit, as the reply to the call does.
+    """
     signal.setitimer(signal.ITIMER_PROF, cpu_s)
 
 

@@ -32,7 +32,7 @@ class OwnedRecord(Protocol):
 
     @property
     def owner(self) -> str:
-        """Name of the holder, which is different for each process and each of its claims."""
+        """Name of the holder; each claim of each process uses another name."""
 
     @property
     def state(self) -> str:
@@ -125,7 +125,7 @@ class Lease(Generic[R]):
         return now
 
     def note_beat(self, beat: int) -> None:
-        """Note that the holder reported its renewal number *beat* in another way than by the store."""
+        """Note that the holder has reported its renewal number *beat* directly, not through the store."""
         self._reported_beat = max(beat, self._reported_beat)
         self._changed_s = self._clock()
 

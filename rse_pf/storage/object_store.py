@@ -73,7 +73,7 @@ class Usage:
     charged_bytes: int = 0
 
     def __add__(self, other: Usage) -> Usage:
-        """Return the usage of the objects of both together."""
+        """Return the usage of the objects in this usage and in *other* together."""
         return Usage(self.objects + other.objects, self.charged_bytes + other.charged_bytes)
 
 
@@ -190,7 +190,7 @@ class MemoryStore:
         self._lock = threading.Lock()
 
     def get(self, name: str) -> bytes:
-        """Return the object."""
+        """Return the bytes of the object *name*; raises NotFound."""
         with self._lock:
             data = self._objects.get(check_name(name))
         if data is None:
@@ -198,24 +198,24 @@ class MemoryStore:
         return data
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return a part of the object."""
+        """Return at most *length* bytes of the object from byte *start* on; raises NotFound."""
         return self.get(name)[start : start + length]
 
     def put(self, name: str, data: bytes) -> None:
-        """Store the object."""
+        """Store *data* as the object *name*, or replace it, in this process only."""
         with self._lock:
             self._objects[check_name(name)] = bytes(data)
 
     def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
-        """Store the object; if *pieces* raises an error, nothing is stored."""
+        """Store the joined *pieces* as the object *name*; if *pieces* raises an error, nothing is stored."""
         self.put(name, b"".join(pieces))
 
     def head(self, name: str) -> ObjectInfo:
-        """Return size and name."""
+        """Return name and size of the object; raises NotFound."""
         return ObjectInfo(name=name, size=len(self.get(name)))
 
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
-        """Yield the objects whose names begin with *prefix* and are greater than *after*."""
+        """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
         with self._lock:
             sizes = sorted(
                 (name, len(data))
@@ -226,21 +226,21 @@ class MemoryStore:
             yield ObjectInfo(name=name, size=size)
 
     def folders(self, prefix: str) -> Iterator[str]:
-        """Yield what stands between *prefix* and the next slash in names."""
+        """Yield, sorted, the names of the folders directly below the folder *prefix*, which ends with /."""
         rests = (info.name.removeprefix(prefix).partition("/") for info in self.list(prefix))
         yield from sorted({folder for folder, slash, _ in rests if slash})
 
     def usage(self, prefix: str) -> Usage:
-        """Return the usage of the objects below *prefix*."""
+        """Return the usage of all objects below the folder *prefix* together."""
         return usage_of(self.list(prefix))
 
     def delete(self, name: str) -> None:
-        """Remove the object."""
+        """Remove the object *name*; a missing object is no error."""
         with self._lock:
             self._objects.pop(check_name(name), None)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected*."""
+        """Replace the object if its content is *expected* (None: missing); raises Conflict otherwise."""
         with self._lock:
             if self._objects.get(check_name(name)) != expected:
                 raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
@@ -261,7 +261,7 @@ class DirectoryStore:
         self._measured: dict[str, tuple[int, Usage, _Names]] = {}
 
     def get(self, name: str) -> bytes:
-        """Return the object."""
+        """Return the bytes of the object *name*; raises NotFound."""
         with _as_store_errors(name), _open(self._path(name)) as file:
             return file.read()
 
@@ -274,16 +274,16 @@ class DirectoryStore:
         return _read_cached(self._path(name), start, length)
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return a part of the object."""
+        """Return at most *length* bytes of the object from byte *start* on; raises NotFound."""
         with _as_store_errors(name), _open(self._path(name)) as file:
             return os.pread(file.fileno(), length, start)
 
     def put(self, name: str, data: bytes) -> None:
-        """Store the object durably."""
+        """Store *data* as the object *name*, or replace it, durably and in one step; raises StoreFull."""
         self._write(name, lambda path: replace_file(path, data, mode=OWNER_ONLY, is_durable=True))
 
     def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
-        """Store the object durably; if *pieces* raises an error, nothing is stored."""
+        """Store the joined *pieces* like `put`; if *pieces* raises an error, nothing is stored."""
         self._write(name, lambda path: _replace_by_pieces(path, pieces))
 
     def append(self, name: str, offset: int, data: bytes) -> None:
@@ -330,7 +330,7 @@ class DirectoryStore:
         self._write(name, rename)
 
     def head(self, name: str) -> ObjectInfo:
-        """Return size and name."""
+        """Return name and size of the object; raises NotFound."""
         with _as_store_errors(name):
             status = os.lstat(self._path(name))
         if not stat.S_ISREG(status.st_mode):
@@ -347,7 +347,7 @@ class DirectoryStore:
             yield from self._walk(above + slash, above + slash, prefix, after)
 
     def folders(self, prefix: str) -> Iterator[str]:
-        """Yield what stands between *prefix* and the next slash in names."""
+        """Yield, sorted, the names of the folders directly below the folder *prefix*, which ends with /."""
         yield from sorted(name for name in self._scan(prefix)[1] if is_name(name))
 
     def usage(self, prefix: str) -> Usage:
@@ -394,7 +394,10 @@ class DirectoryStore:
                     os.rmdir(folder)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if its content is *expected*; a lock file excludes other writers."""
+        """Replace the object if its content is *expected* (None: missing); raises Conflict otherwise.
+
+        A lock file next to the object excludes other writers.
+        """
 
         def check() -> None:
             try:

@@ -184,7 +184,7 @@ class TenantAccount:
         return is_drawn
 
     def _spend_drawn(self, charge: int) -> bool:
-        """Subtract *charge* from the drawn bytes, if there are as many; return whether there were."""
+        """Subtract *charge* from the drawn bytes; return False, without a change, if there are fewer."""
         if not self._is_drawn() or self._drawn_bytes < charge:
             return False
         self._drawn_bytes -= charge
@@ -547,7 +547,7 @@ class Accounts:
             return account
 
     def _count_if_old(self, account: _RobotAccount, robot: RobotId) -> None:
-        """Count what *robot* stores, if the last count is older than the time between two counts."""
+        """Count the usage of *robot* in the store, if the last count is older than `_recount_s` allows."""
         now = self._clock()
         if now - account.counted_s >= self._recount_s:
             total = self._store.usage(f"objects/{robot.folder}/")

@@ -322,7 +322,7 @@ class ClientSession:
         return connection
 
     def close_connection(self, connection: ConnectionState) -> None:
-        """Record that *connection* was lost or closed; its unanswered commands wait for the next one."""
+        """Record that *connection* was lost or closed; its unanswered commands are sent on the next one."""
         connection.lost = True
         self.subscriptions.lose(connection)
         if self.current is connection:
@@ -390,7 +390,7 @@ class ClientSession:
                 return self._answer(connection, message, now) + self._flush(now)
 
     def renew(self, connection: ConnectionState, token: str) -> None:
-        """Send a fresh *token* on *connection*, so that the server keeps the connection until it expires."""
+        """Send a fresh *token* on *connection*, which the server then keeps until this token expires."""
         connection.outgoing.append(self.codec.encode(Renew(token=token)))
 
     def due(self, now: float) -> list[Event]:
@@ -510,7 +510,7 @@ class ClientSession:
         return bool(command.stream) and not command.keep and command.seq < self._sequence[command.stream]
 
     def _not_before(self, pending: _Pending) -> float:
-        """Return the time until which this command waits, because it or its stream was answered ``busy``."""
+        """Return the time until which *pending* waits, because its stream or itself was answered ``busy``."""
         until_s, _ = self._busy_streams.get(pending.command.stream, (0.0, None))
         return max(pending.not_before, until_s)
 
@@ -712,7 +712,7 @@ def _with_deadline(command: Command, remaining_s: float) -> Command:
 
 
 def _is_frame(pending: _Pending) -> bool:
-    """Return whether the command is a frame: it belongs to a stream and has a deadline."""
+    """Return whether *pending* is a frame: a command with a stream and a deadline."""
     return bool(pending.command.stream) and math.isfinite(pending.deadline)
 
 

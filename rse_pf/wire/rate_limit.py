@@ -63,7 +63,10 @@ def command_burst(max_commands_per_s: float) -> int:
 
 
 class RateLimiter:
-    """How fast a robot may send on one connection; unlimited without *limits* or without a rate in them."""
+    """Limits the messages that a robot sends on one connection to a rate a little below the server's limit.
+
+    There is no limit without *limits*, or if ``max_commands_per_s`` is 0.
+    """
 
     __slots__ = ("_bucket",)
 
@@ -86,7 +89,7 @@ class RateLimiter:
             self._bucket.spend(1.0, now)
 
     def next_s(self, now: float) -> float:
-        """Return the time at which the next message may be sent; it is *now* if one may be sent at once."""
+        """Return the time (s) at which the next message may be sent: *now* if it may be sent at once."""
         return now if self._bucket is None else now + self._bucket.wait_s(now)
 
 
