@@ -42,7 +42,7 @@ scan has few bytes; cameras write ten scans."""
 _FRAMES = range(0xC0, 0xD0)  # second bytes of JPEG markers; segments with these state the size of the image
 _NO_FRAMES = (0xC4, 0xC8, 0xCC)  # exceptions in `_FRAMES`: segments with these state no size
 _DECODED_FRAMES = (0xC0, 0xC1, 0xC2)
-"""Those of `_FRAMES` that are accepted: baseline, extended and progressive Huffman coding."""
+"""Second bytes of the JPEG markers of the accepted codings: baseline, extended and progressive Huffman."""
 _SCAN = b"\xff\xda"  # marker at the start of each scan of a JPEG
 _END_OF_JPEG = b"\xff\xd9"  # marker at the end of a JPEG
 _END_OF_PNG = b"IEND"  # name of the last chunk of a PNG

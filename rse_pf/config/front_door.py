@@ -60,8 +60,8 @@ signature.  The form does not show that the token is valid."""
 STATUS = 429
 """HTTP status of the answer to a request above a rate limit: Too Many Requests."""
 RETRY_AFTER_S = 60
-"""Seconds in the header Retry-After of such an answer: after one window of `_MINUTE_S` without requests an
-address is below its limit."""
+"""Seconds in the header Retry-After of the answer to a request above a rate limit: after one window of
+`_MINUTE_S` without requests, an address is below its limit."""
 _ADDRESS_SHARE = 0.4
 """Fraction of the limit on burst commands of all robots that one source address may use, so that one site
 cannot use the whole limit."""

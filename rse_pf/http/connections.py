@@ -31,13 +31,14 @@ __all__ = ["MAX_HEADERS", "MAX_HEAD_BYTES", "OneRequestProtocol", "bounded_proto
 
 MAX_HEAD_BYTES = 16384  # largest head of a request: a token, the longest header, has at most 4 KiB
 MAX_HEADERS = 64  # most headers of a request: browsers and load balancers send fewer than 30
-# Bytes for the sizes and line ends of the chunks of a chunked body, in addition to those that `FRAMING_SHIFT`
-# allows.  A body of many tiny chunks would cost much CPU time.
+# Most bytes of framing (sizes and line ends of the chunks) of a chunked body, in addition to those that
+# `FRAMING_SHIFT` allows: a body of many tiny chunks costs much CPU time.
 MAX_FRAMING_BYTES = 4096
-FRAMING_SHIFT = 3  # binary exponent: these bytes may also be 2**-3, an eighth, of the data in chunks
+# Bytes of framing that each byte of data in a chunked body allows, as a power of two: 2**-3, an eighth.
+FRAMING_SHIFT = 3
 PARSED_AT_ONCE_BYTES = 16384  # received bytes of a chunked body between two checks of `MAX_FRAMING_BYTES`
 UNSENT_HIGH_BYTES = 1 << 19  # unsent bytes of a reply above which the application waits for the client
-UNSENT_LOW_BYTES = 1 << 18  # unsent bytes of a reply down to which the application waits then
+UNSENT_LOW_BYTES = 1 << 18  # unsent bytes of a reply at which an application that waits continues
 _END_OF_HEAD = b"\r\n\r\n"
 # A whole request head that is accepted: the form of RFC 9112 without its obsolete variants.
 _HEAD = re.compile(

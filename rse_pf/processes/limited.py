@@ -70,8 +70,8 @@ _ORDER_TIMEOUT_S = 10.0
 _BUSY_RETRY_MS = 1000.0
 """Milliseconds after which a caller may try again if no process was free."""
 _NEAR = 4
-"""Number of the latest different values of *near* that are remembered for each process: a process caches the
-data of a few calls only."""
+"""Number of the latest different keys (*near* of `LimitedProcesses.call`) that are remembered for each
+process, which caches the data of a few calls only."""
 _OUT_OF_MEMORY = 77
 """Exit code of a process whose handler raised MemoryError."""
 _NO_MEMORY = how_ended(_OUT_OF_MEMORY)

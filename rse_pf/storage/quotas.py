@@ -60,8 +60,8 @@ _T = TypeVar("_T")
 _RECOUNT_S = 10.0  # seconds between two counts of a folder, of which only changed subfolders are read
 _SLOW_RECOUNT_S = 600.0  # seconds between two counts of another store, for which all objects are listed
 _REFUSED_RECOUNT_SHARE = 0.1
-"""Fraction of these times after which a tenant is counted again before it is refused, because it may have
-deleted objects."""
+"""Fraction of `_RECOUNT_S` or `_SLOW_RECOUNT_S` after which a tenant is counted again before it is refused,
+because it may have deleted objects."""
 _MAX_ACCOUNTS = 10_000  # most robots, and most tenants, whose counts a process remembers
 _MAX_DRAWN_BYTES = 16 << 20  # most bytes that a process draws from the account of a tenant at once
 _DRAWN_DIVISOR = 64  # a process draws 1/64 of the bytes left, so that several can use a nearly full account

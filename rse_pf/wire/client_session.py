@@ -148,7 +148,22 @@ Event = (
 
 @dataclass(slots=True, kw_only=True)
 class _Pending:
-    """A command without a final answer; ``connection`` is None while it waits to be sent."""
+    """A command without a final answer.
+
+    Attributes:
+        command: The command, without its deadline.
+        deadline: Time of the robot's clock at which the command ends with ``expired``; infinite for none.
+        submitted: Time at which the session accepted the command.
+        wire_bytes: Size of its message.
+        sent_at: Time at which it was sent last; None if it was not sent yet.
+        connection: The connection on which it was sent; None while it waits to be sent (again).
+        not_before: Time before which it is not sent again, after the answer ``busy``.
+        losses: Number of answers ``worker-lost``.
+        cancelled: Whether its caller has cancelled it.
+        was_held: Whether it is counted in ``held_back``.
+        has_default_deadline: Whether its caller gave no deadline.
+        is_long: Whether the server has reported progress on it.
+    """
 
     command: Command
     deadline: float
@@ -168,9 +183,21 @@ class _Pending:
 class ConnectionState:
     """What the robot knows of one WebSocket.
 
-    ``outgoing`` are the encoded messages that the caller has to send on it.  ``leaving`` is set when another
-    connection became the current one, ``lost`` when this one was lost or closed.  Times are seconds of the
-    robot's clock.
+    Attributes:
+        opened: Time of the robot's clock at which the WebSocket was opened.
+        welcome: The Welcome of the server, None before it.
+        leaving: Whether another connection has become the current one.
+        lost: Whether this connection was lost or closed.
+        last_received: Time of the last message of the server.
+        last_checked: Time of the last call of `ClientSession.check`.
+        last_ping: Time of the last ping, None before it.
+        ping_sent: Time of the first ping since the last pong, None if there is none.
+        clock_offset: Estimate of the offset between the clocks of robot and server.
+        last_exchange: The timestamps of the last plausible ping and pong.
+        outgoing: Encoded messages that the caller has to send on this connection.
+        rate_limiter: Limits the messages of the robot.
+        renewal: When the robot's token has to be renewed.
+        backlog: Limits the frames in flight after a long outage; None otherwise.
     """
 
     opened: float
