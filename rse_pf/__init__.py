@@ -6,8 +6,9 @@ The core:
 - commands: `wire` (the protocol), `services` (what robots may ask), `native` (the C++ library)
 - servers: `server` (backend servers, which robots connect to), `data_server` (maps and files by HTTP)
 - places to run: `local` (one machine), `aws`, `scaling` (the rules of both)
-- what all need: `config`, `auth`, `audit`, `storage`, `limits`, `http`, `processes`
-- `cli`, the command ``rse-pf``; `command_line`, what its verbs share
+- used by all of these: `config`, `auth`, `audit`, `storage`, `limits`, `http`, `processes`
+- `cli`, the command ``rse-pf``; `command_line`, the code that several of its verbs use
 
-What the platform works without is in `extensions`.  Modules beside these packages serve several of them.
+Packages without which the platform works are in `extensions`.  The modules directly in this package are used
+by several packages.
 """

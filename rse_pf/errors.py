@@ -240,7 +240,7 @@ class LimitExceeded(ProtocolError, code="too-large"):
 
 
 class UnsupportedProtocol(ProtocolError, code="unsupported"):
-    """The two sides share no sub-protocol or version.
+    """Robot and server have no sub-protocol or version of the protocol in common.
 
     Cause: The server does not offer the requested sub-protocol, or the address is not one of RSE-PF.
     Check: Check the address and its path /ws, and that robot and server have the same major version.
@@ -351,7 +351,7 @@ class Cancelled(CommandFailed, code="cancelled"):
 
 
 class WorkerLost(CommandFailed, code="worker-lost"):
-    """The process that worked on the command died.
+    """The process that worked on the command was killed or exited before it answered.
 
     Cause: A worker process or its server was killed, or ran out of memory.
     Check: Look at the server's log, and at the kernel's log for out of memory: dmesg.

@@ -1,7 +1,7 @@
-"""The token of a control port, which allows to read a server's metrics, to drain it and to move its robots.
+"""The control token, with which a client of a control port may read metrics, drain a server and move robots.
 
-The token is a secret of one machine, in a file that only its owner can read.  Clients send it as
-``Authorization: Bearer``.  It is unrelated to robots' tokens and appears in no message.
+The token is a secret of one machine, in a file that only its user can read.  Clients send it in the header
+``Authorization: Bearer``.  It has nothing to do with robots' tokens, and no message contains it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _CREATE_HINT = "create one: (umask 077; openssl rand -hex 32 > FILE)"
 
 
 def bearer(token: str) -> str:
-    """Return the value of the ``Authorization`` header that carries *token*."""
+    """Return the value of the header ``Authorization`` with which a client sends *token*."""
     return f"Bearer {token}"
 
 

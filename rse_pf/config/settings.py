@@ -225,7 +225,7 @@ class LocalSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BurstSettings:
-    """Poses from a serverless function while the servers are busy, late or gone."""
+    """Poses from a serverless function while no server answers in time."""
 
     url: str = setting("", doc="where robots send commands by HTTP when no server answers in time: an address, or a path at the address of the platform; empty: /burst on AWS, and elsewhere nowhere")
     robot_commands_per_day: int = setting(10000, unit="commands", doc="most commands that a robot sends to burst.url in a day; it computes further ones by itself; 0: it sends none", low=0)

@@ -685,8 +685,8 @@ class ClientSession:
         pending.is_long = True
         if pending.has_default_deadline:
             pending.deadline = math.inf
-        share = min(1.0, max(0.0, progress.done)) if math.isfinite(progress.done) else 0.0
-        return [Progressed(progress.id, share, progress.what)]
+        done = min(1.0, max(0.0, progress.done)) if math.isfinite(progress.done) else 0.0
+        return [Progressed(progress.id, done, progress.what)]
 
     def _cancel_on_server(self, pending: _Pending) -> None:
         pending.cancelled = True
