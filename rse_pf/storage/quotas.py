@@ -255,7 +255,7 @@ class TenantAccount:
         if held + charge + margin <= share:
             return None
         return StoreFull(
-            f"the disk is nearly full, and the tenant {self._tenant!r} stores {held} bytes; an equal part of "
+            f"the disk is nearly full, and the tenant {self._tenant!r} holds {held} bytes; an equal part of "
             f"the disk is {share:.0f}",
             hint="delete objects or maps of this tenant, or use a larger disk",
         )
