@@ -124,7 +124,7 @@ class Roster(_Value, frozen=True, kw_only=True):
         for other in others:
             if other.tenant == robot.tenant and _shared_form(other.robot) == shared_form:
                 raise UsageError(
-                    f"the name {robot.robot!r} can be confused with {other.robot!r}, which is enrolled",
+                    f"robot {robot.robot!r} looks like {other.robot!r}, which is enrolled",
                     hint="choose a name that differs in more than case, spaces or a form of its letters",
                 )
             if other.x == robot.x:
