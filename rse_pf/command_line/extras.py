@@ -101,6 +101,7 @@ EXTRAS: dict[str, Extra] = {
 VERBS_NEED: dict[str, tuple[str, ...]] = {
     "demo": ("demo",),
     "demo --merge": ("demo", "maps"),
+    "demo --live": ("demo", "maps"),
     "check": ("demo",),
     "compare": ("demo",),
     "experiment": ("experiments",),

@@ -2,7 +2,7 @@
 
 Each live map has one map server, a process of some backend server; its address is in the store, and it must
 be reachable from this machine.  If no server has the map now, a map server is started here for the time of
-the command; ``list`` and ``show`` start none.
+the command, which needs the extra ``maps``; ``list`` and ``show`` start none.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
+from rse_pf.command_line.extras import require
 from rse_pf.command_line.map_store import MapRequest, StoreRequest
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
@@ -60,6 +61,7 @@ class _ForgetRequest(MapRequest):
 
 def run_publish(request: MapRequest, settings: PlatformSettings) -> None:
     """Publish a live map as the next version of the map of the same name, and print that version."""
+    require("map publish")
     settings = request.settings_with_store(settings)
     reply = _ask(request, settings, "live-publish", LiveMapRequest(map=request.name))
     _record(request, settings, reply)
@@ -104,6 +106,7 @@ def _show(request: MapRequest, settings: PlatformSettings) -> None:
 
 def _start(request: _StartRequest, settings: PlatformSettings) -> None:
     """Begin a live map, empty or with the keyframes of a version of a map."""
+    require("map live")
     settings = request.settings_with_store(settings)
     start = LiveStart(map=request.name, source=request.source, equal_rooms_m=request.equal_rooms_m)
     reply = _ask(request, settings, "live-start", start)
@@ -112,6 +115,7 @@ def _start(request: _StartRequest, settings: PlatformSettings) -> None:
 
 def _stop(request: MapRequest, settings: PlatformSettings) -> None:
     """Publish a live map as a version, unless it is empty, and close it."""
+    require("map live")
     settings = request.settings_with_store(settings)
     reply = _ask(request, settings, "live-stop", LiveMapRequest(map=request.name))
     if reply:
@@ -126,6 +130,7 @@ def _stop(request: MapRequest, settings: PlatformSettings) -> None:
 
 def _forget(request: _ForgetRequest, settings: PlatformSettings) -> None:
     """Remove all that one robot contributed to a live map."""
+    require("map live")
     settings = request.settings_with_store(settings)
     reply = _ask(request, settings, "live-forget", LiveForget(map=request.name, robot=request.robot))
     request.print(reply, f"{request.name} holds nothing of {request.robot} any more")

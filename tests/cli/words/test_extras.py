@@ -55,6 +55,30 @@ def test_a_verb_that_starts_a_platform_names_the_extra_that_holds_all_of_it(
     assert hint == "  hint: pip install 'rse-pf[local]'"
 
 
+@pytest.mark.parametrize(
+    "typed",
+    [
+        ["demo", "--live"], ["map", "publish", "hall"], ["map", "live", "start", "hall"],
+        ["map", "live", "stop", "hall"], ["map", "live", "forget", "hall", "robot-1"],
+    ],
+)  # fmt: skip
+def test_a_verb_that_starts_a_live_map_names_the_extra_that_optimises_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, typed: list[str]
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        extras.importlib.util, "find_spec", lambda name: None if name == "gtsam" else found(name)
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+    assert main(typed) == 2
+    first, hint = capsys.readouterr().err.splitlines()
+    assert first == "MissingExtra: gtsam is not installed: it is in the extra 'maps'"
+    assert hint == "  hint: pip install 'rse-pf[maps]'"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_module_that_cannot_be_imported_is_reported_as_its_extra(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

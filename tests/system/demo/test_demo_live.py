@@ -21,6 +21,7 @@ from rse_pf.server.live_map.lease import decode_lease, lease_name
 from rse_pf.storage.object_store import DirectoryStore
 from tests.system.demo.test_demo import demo, finish, pids_of, read_until
 
+pytest.importorskip("gtsam", reason="the extra maps is not installed")
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 RECORDING = Path(__file__).parents[3].parent / "shared" / "data" / "7scenes_redkitchen"

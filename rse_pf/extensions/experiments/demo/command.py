@@ -119,7 +119,7 @@ def demo(request: DemoRequest, settings: PlatformSettings) -> int:
         raise UsageError(f"--seed {request.seed} is below 0", hint="choose 0 or more")
     if request.live and request.merge:
         raise UsageError("--live and --merge exclude each other", hint="a live map needs no merge")
-    require("demo --merge" if request.merge else "demo")
+    require("demo --merge" if request.merge else "demo --live" if request.live else "demo")
     from client_sdk.plugins import load_features
 
     load_features(request.features)

@@ -104,6 +104,7 @@ EVENTS: Mapping[str, str] = {
     "live-alignment-lost": "{robot} is no longer aligned with the live map {map}: {reason}",
     "live-map-given-up": "{server} no longer serves the live map {map} ({how})",
     "live-map-lost": "{server} lost the live map {map} to another server: {reason}",
+    "live-map-not-optimised": "the live map {map} is less accurate than it could be: {reason}: {fix}",
     "live-map-owned": "{server} serves the live map {map} with {keyframes} keyframes",
     "live-map-published": "version {number} of the live map {map} is published",
     "metrics-port-taken": "port {port} is taken: the metrics have another one",

@@ -20,6 +20,7 @@ import asyncio
 import contextlib
 import functools
 import importlib
+import importlib.util
 import os
 import secrets
 import socket
@@ -36,7 +37,7 @@ import msgspec
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import live_ports
-from rse_pf.errors import StoreError
+from rse_pf.errors import MissingExtra, StoreError
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.processes.ipc import FrameReader, encode_message, receive
 from rse_pf.server.live_map.connection_security import (
@@ -63,7 +64,7 @@ from rse_pf.server.log import JsonLog
 from rse_pf.storage.object_store import ObjectStore
 from rse_pf.storage.quotas import TenantAccount
 
-__all__ = ["advertised_address", "run"]
+__all__ = ["advertised_address", "run", "warn_without_optimiser"]
 
 _READ_BYTES = 1 << 16  # largest number of bytes that one read of the worker's socket returns
 _RETRY_S = 0.1
@@ -100,6 +101,16 @@ def advertised_address(host: str) -> str:
         except OSError:
             return loopback
         return str(probe.getsockname()[0])
+
+
+def warn_without_optimiser(log: JsonLog, map_name: str) -> None:
+    """Log that the map stays less accurate if gtsam is not installed, which optimises its whole pose graph.
+
+    Such a map is served all the same: the smoother, which needs no gtsam, still corrects it in parts.
+    """
+    if importlib.util.find_spec("gtsam") is None:
+        missing = MissingExtra("gtsam", "maps")
+        log.warning("live-map-not-optimised", map=map_name, reason=missing.message, fix=missing.hint)
 
 
 def run(worker: socket.socket) -> None:
@@ -208,6 +219,7 @@ class _MapServerProcess:
         """Claim the lease, restore the map and serve it; return when the process has to exit."""
         self._threads.start()
         self._log.start()
+        warn_without_optimiser(self._log, self._order.map_name)
         # 1. Claim the lease; if another process was first, report ``lost`` and exit.
         if not await self._retry(self._threads.lease, lambda: self._lease.claim(self._order.known)):
             self._worker.sendall(encode_message(["lost"]))
