@@ -1,7 +1,8 @@
 """Run one verb of the command line: find it, read the settings, print an error as two lines.
 
 A verb is a module, see `verb_module`: its docstring is its help page, and its ``ACTION`` holds its request or
-its actions, see `rse_pf.command_line.options`.  Only the module of the verb is imported.
+its actions, see `rse_pf.command_line.options`.  Only the module of the verb is imported.  A distribution of
+somebody else adds a verb by an entry point of the group ``rse_pf.verbs``; its defects break no other verb.
 Exit codes: 0 done, 1 failed, 2 wrong call or settings, 130 interrupted.  Named errors print no traceback.
 """
 
@@ -13,7 +14,8 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rse_pf.command_line.options import Parser, add_action, add_settings, perform
 from rse_pf.config import load_settings
@@ -21,6 +23,9 @@ from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
 from rse_pf.processes.one_thread import ONE_THREAD
 from rse_pf.terminal import show, show_error, show_page
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 __all__ = ["VERBS", "main", "parser_of", "verb_module"]
 
@@ -128,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def verb_module(name: str) -> Any:
     """Import and return the module of the verb *name*."""
-    return importlib.import_module(_MODULES[name])
+    return importlib.import_module(_MODULES[name]) if name in _MODULES else _installed_verbs()[name].load()
 
 
 def parser_of(name: str) -> Parser:
@@ -158,8 +163,21 @@ def _run(words: list[str]) -> int:
     name, *rest = words
     if name.startswith("-"):
         raise UsageError(f"{name} comes before the verb", hint="write rse-pf VERB OPTIONS; see rse-pf --help")
-    if name not in VERBS:
-        raise UsageError(f"there is no verb {name!r}", hint=did_you_mean(name, VERBS))
+    if name in VERBS:
+        return _run_verb(name, rest)
+    installed = _installed_verbs()
+    if name not in installed:
+        raise UsageError(f"there is no verb {name!r}", hint=did_you_mean(name, [*VERBS, *installed]))
+    try:
+        return _run_verb(name, rest)
+    except (RsePfError, OSError):
+        raise
+    except Exception as error:
+        raise _error_of_installed_verb(installed[name], error) from error
+
+
+def _run_verb(name: str, rest: list[str]) -> int:
+    """Run the verb *name* with the words *rest*, or print its help page; return the exit code."""
     try:
         parsed = parser_of(name).parse_args(rest)
     except SystemExit as over:  # --help has printed its page
@@ -182,9 +200,42 @@ def _hint_for_option(error: SettingsError, words: list[str]) -> str:
     return error.hint
 
 
+def _installed_verbs() -> dict[str, EntryPoint]:
+    """Return the verbs that other distributions add, by name; a verb of the table cannot be replaced."""
+    # Only for words outside of the table: this import and the search take half as long as a short verb.
+    from importlib.metadata import entry_points
+
+    return {entry.name: entry for entry in entry_points(group="rse_pf.verbs") if entry.name not in VERBS}
+
+
+def _error_of_installed_verb(entry: EntryPoint, error: BaseException) -> RsePfError:
+    """Return the error that names the distribution of *entry*, and the line that raised *error*."""
+    from traceback import extract_tb
+
+    owner = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+    line = extract_tb(error.__traceback__)[-1]
+    # These two name module or line themselves, and are raised in Python's own files.
+    names_itself = isinstance(error, ImportError | SyntaxError)
+    where = "" if names_itself else f" ({Path(line.filename).name}, line {line.lineno})"
+    return RsePfError(
+        f"the verb {entry.name} of {owner} raised {type(error).__name__}: {error}{where}",
+        hint=f"update or remove it with pip, or report this to the authors of {owner}",
+    )
+
+
+def _help_of_installed_verb(entry: EntryPoint) -> str:
+    """Return the first line of the docstring of the verb's module, or what is wrong with the module."""
+    try:
+        return (entry.load().__doc__ or "").strip().partition("\n")[0]
+    except (Exception, SystemExit) as error:  # noqa: BLE001  other verbs are listed whatever this one does
+        return _error_of_installed_verb(entry, error).message
+
+
 def _front_page() -> str:
-    width = max(map(len, VERBS))
-    verbs = "\n".join(f"  {name:<{width}}  {text}" for name, text in VERBS.items())
+    installed = {name: _help_of_installed_verb(entry) for name, entry in _installed_verbs().items()}
+    texts = VERBS | installed
+    width = max(map(len, texts))
+    verbs = "\n".join(f"  {name:<{width}}  {text}" for name, text in texts.items())
     return (
         "usage: rse-pf VERB [OPTIONS]\n\n"
         "RSE-PF, a robust, secure, elastic cloud robotics platform for distributed visual SLAM.\n\n"
