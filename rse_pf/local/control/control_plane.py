@@ -33,11 +33,12 @@ from rse_pf.local.control.monitor import (
     sample_interval_s,
     server_sample,
 )
-from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
+from rse_pf.local.control.rebalancer import Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
 from rse_pf.scaling.profile import cadence_of
+from rse_pf.scaling.rebalance import MoveOrder
 
 __all__ = ["ControlOptions", "ControlPlane"]
 
@@ -300,24 +301,22 @@ class ControlPlane:
         if self._rebalancer is None or self.hold:
             return
         robots = {server.name: server.robots for server in sample.servers if server.state == "healthy"}
-        for request in self._rebalancer.requests(robots, sample.time):
-            self._fleet.keep(self._move(request))
+        for name, order in self._rebalancer.plan_orders(robots, sample.time).items():
+            self._fleet.keep(self._move(name, order))
 
-    async def _move(self, request: MoveRequest) -> None:
+    async def _move(self, name: str, order: MoveOrder) -> None:
         """Ask a server to move robots, and emit ``rebalance`` if it asks any to move."""
-        member = self._fleet.members.get(request.server)
+        member = self._fleet.members.get(name)
         if member is None or member.server is None:
             return
-        target = f"/move?robots={request.robots}&spread_s={request.spread_s:g}"
+        target = f"/move?robots={order.robots}&spread_s={order.spread_s:g}"
         port = self._fleet.control(member.server)
         reply = await port.ask_once(target, timeout_s=_MOVE_TIMEOUT_S, method="POST")
         if reply is None or reply.status >= 300:
-            return  # the next sample leads to another request
+            return  # a later sample leads to another order
         answer = reply.document()
         if answer.get("robots"):
-            self._emit(
-                "rebalance", server=request.server, robots=answer["robots"], spread_s=answer["spread_s"]
-            )
+            self._emit("rebalance", server=name, robots=answer["robots"], spread_s=answer["spread_s"])
 
     # --- restart of a lost load balancer ----------------------------------------------------------
 

@@ -308,8 +308,8 @@ class Fleet:
             dead=dict(self.dead),
         )
 
-    def grow(self, count: int, reason: str, *, on_trial: bool = False) -> Sequence[str]:
-        """Launch *count* servers and return their names at once; *reason* is not used.
+    def grow(self, count: int, *, on_trial: bool = False) -> Sequence[str]:
+        """Launch *count* servers and return their names at once.
 
         With *on_trial*, a server that never becomes healthy is not replaced.
         """
@@ -333,7 +333,7 @@ class Fleet:
         self.keep(self.finish_drain(least, time.monotonic()))
         return least.name
 
-    def launch_replacement(self, name: str, reason: str) -> str:
+    def launch_replacement(self, name: str) -> str:
         """Launch a server in place of *name*, and return the new name.
 
         If *name* still runs, it gets no new robots and is killed, so that its robots connect to other

@@ -315,7 +315,7 @@ class LocalPlatform:
         Raises:
             ConfigurationError: One of them did not become healthy.
         """
-        names = list(self._fleet.grow(n, reason))
+        names = list(self._fleet.grow(n))
         self._emit("grow", servers=n, names=names, reason=reason)
         await self._wait_until_healthy(names)
         return names
@@ -357,7 +357,7 @@ class LocalPlatform:
             ConfigurationError: The new server did not become healthy.
         """
         self._fleet.member(name)
-        new = self._fleet.launch_replacement(name, reason)
+        new = self._fleet.launch_replacement(name)
         self._emit("replace", servers=1, server=name, by=new, reason=reason)
         await self._wait_until_healthy([new])
         return new
@@ -430,7 +430,7 @@ class LocalPlatform:
             for number, old in enumerate(servers, 1):
                 self._emit("roll-step", server=old, number=number, of=len(servers))
                 await self.backend_servers.standby.wait_warm(self.settings.local.start_timeout_s)
-                names = list(self._fleet.grow(1, "rolling replacement", on_trial=True))
+                names = list(self._fleet.grow(1, on_trial=True))
                 try:
                     await self._wait_until_healthy(names)
                 except ConfigurationError as error:

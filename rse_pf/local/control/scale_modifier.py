@@ -155,7 +155,7 @@ class LocalScaleModifier:
 
     def _scale(self, action: Action) -> None:
         if action.kind == "grow":
-            names = self._servers.grow(action.servers, action.reason)
+            names = self._servers.grow(action.servers)
             self._emit("grow", servers=len(names), names=list(names), reason=action.reason)
             self._last = action
         elif action.kind == "shrink":
@@ -177,7 +177,7 @@ class LocalScaleModifier:
 
     def _launch_replacement(self, name: str, reason: str, now_s: float) -> None:
         self._starts.append(now_s)
-        new = self._servers.launch_replacement(name, reason)
+        new = self._servers.launch_replacement(name)
         self._emit("replace", servers=1, server=name, by=new, names=[name], reason=reason)
         self._last = Action(kind="replace", servers=1, names=(name,), reason=reason)
 

@@ -118,7 +118,7 @@ async def a_fleet() -> AsyncIterator[World]:
 async def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None:
     async with a_fleet() as world:
         first, _ = await world.up(2)
-        world.fleet.launch_replacement(first.name, "it failed its health checks")
+        world.fleet.launch_replacement(first.name)
         assert world.servers.signals == [("server-1", signal.SIGKILL)]
         assert world.balancer.targets[-1] == ["server-2"]
         assert world.fleet.standing(0.0).replacing == 1
@@ -142,7 +142,7 @@ async def test_the_one_with_the_fewest_robots_is_drained_and_the_last_one_never(
 async def test_a_start_that_fails_is_a_young_death_and_an_event() -> None:
     async with a_fleet() as world:
         world.servers.broken.add("server-1")
-        world.fleet.grow(1, "asked")
+        world.fleet.grow(1)
         while not world.fleet.dead:
             await asyncio.sleep(0)
 
@@ -197,7 +197,7 @@ async def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None
         assert (standing.servers, standing.healthy, dict(standing.dead)) == (2, 1, {"server-1": True})
         assert world.balancer.targets[-1] == ["server-2"]
 
-        assert world.fleet.launch_replacement("server-1", "it ended") == "server-3"
+        assert world.fleet.launch_replacement("server-1") == "server-3"
 
         assert world.fleet.standing(0.0).servers == 2
         assert world.fleet.dead == {}
@@ -209,6 +209,6 @@ async def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
         world.fleet.note_own_drain(first)
         world.fleet.note_own_drain(first)
         assert world.fleet.dead == {"server-1": False}
-        world.fleet.launch_replacement(first.name, "it ended")
+        world.fleet.launch_replacement(first.name)
         assert world.servers.signals == []
         assert [each["event"] for each in world.events].count("drain-start") == 1

@@ -10,7 +10,7 @@ UNEVEN = {"server-1": 50, "server-2": 50, "server-3": 0}
 def watching(robots: dict[str, int], since_s: float = 100.0) -> Rebalancer:
     """Return one that watches since *since_s*, and has seen *robots* just before."""
     rebalancer = Rebalancer()
-    rebalancer.requests(robots, since_s - 1.0)
+    rebalancer.plan_orders(robots, since_s - 1.0)
     rebalancer.watch(since_s)
     return rebalancer
 
@@ -18,15 +18,15 @@ def watching(robots: dict[str, int], since_s: float = 100.0) -> Rebalancer:
 def test_crowded_servers_are_asked_at_the_rate_that_is_allowed() -> None:
     rebalancer = watching(UNEVEN)
 
-    orders = rebalancer.requests(UNEVEN, 100.5)
+    orders = rebalancer.plan_orders(UNEVEN, 100.5)
 
-    assert {order.server for order in orders} == {"server-1", "server-2"}
-    assert all(order.robots > 0 and order.spread_s == order.robots / 20.0 for order in orders)
+    assert orders.keys() == {"server-1", "server-2"}
+    assert all(order.robots > 0 and order.spread_s == order.robots / 20.0 for order in orders.values())
 
 
 def test_an_order_is_not_repeated_before_its_robots_had_time_to_move_and_then_it_is() -> None:
     rebalancer = watching(UNEVEN)
-    longest_s = max(order.spread_s for order in rebalancer.requests(UNEVEN, 100.0))
+    longest_s = max(order.spread_s for order in rebalancer.plan_orders(UNEVEN, 100.0).values())
 
-    assert rebalancer.requests(UNEVEN, 100.0 + longest_s) == ()
-    assert rebalancer.requests(UNEVEN, 100.0 + longest_s + 2.0) != ()
+    assert rebalancer.plan_orders(UNEVEN, 100.0 + longest_s) == {}
+    assert rebalancer.plan_orders(UNEVEN, 100.0 + longest_s + 2.0) != {}

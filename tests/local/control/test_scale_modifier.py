@@ -32,7 +32,7 @@ class FakeServers:
     def standing(self, now_s: float) -> ServerHealth:
         return self.now
 
-    def grow(self, count: int, reason: str) -> list[str]:
+    def grow(self, count: int) -> list[str]:
         self.asked.append(("grow", count))
         return [self._name() for _ in range(count)]
 
@@ -40,7 +40,7 @@ class FakeServers:
         self.asked.append(("shrink",))
         return "server-1" if self.now.healthy > 1 else None
 
-    def launch_replacement(self, name: str, reason: str) -> str:
+    def launch_replacement(self, name: str) -> str:
         self.asked.append(("replace", name))
         return self._name()
 

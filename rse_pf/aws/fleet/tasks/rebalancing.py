@@ -130,7 +130,7 @@ def read_totals(cloudwatch: Any, group: str, period_s: int, end_s: float) -> tup
     }
     robots, servers = sums.get("robots", {}), sums.get("servers", {})
     return tuple(
-        Totals(start_s=float(at), robots=round(robots[at]), servers=round(servers[at]))
+        Totals(robots=round(robots[at]), servers=round(servers[at]))
         for at in sorted(robots, reverse=True)
         if at in servers
     )
