@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
     from client_sdk.offloading.offload_policy import CloudFirst
     from client_sdk.point_map import MapOptions, PointMap
+    from client_sdk.recording import RobotRecorder
     from client_sdk.robot import Robot, connect
     from client_sdk.tracking.tracker import Tracker
     from client_sdk.trajectory import Trajectory
@@ -54,6 +55,7 @@ __all__ = [
     "PoseAnswer",
     "PoseQuery",
     "Robot",
+    "RobotRecorder",
     "RsePfError",
     "Stats",
     "TrackedFrame",
@@ -92,6 +94,7 @@ _HOMES = {
     "PoseAnswer": "commands.answer_types",
     "PoseQuery": "frontend",
     "Robot": "robot",
+    "RobotRecorder": "recording",
     "Stats": "commands.traffic_stats",
     "TrackedFrame": "frontend",
     "Tracker": "tracking.tracker",

@@ -40,7 +40,7 @@ from client_sdk.imu.samples import ImuSamples
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Plugins
 from client_sdk.point_map import MapOptions, PointMap, write_ply
-from client_sdk.recording import NullRobotRecorder, RobotRecorder
+from client_sdk.recording import RobotRecorder
 from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.segments import (
@@ -188,7 +188,7 @@ class Mapper:
         self._records = DriveRecords(self._map_options)
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
-        self._recorder = recorder or NullRobotRecorder()
+        self._recorder = recorder
         self._plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
         self._processed_joins = 0  # joins that were applied; with a monocular tracker, plus its loop closures
         self._depth_source: Literal["depth", "stereo"] = "depth"
@@ -217,7 +217,8 @@ class Mapper:
         async with self._frame_lock:
             # 1. Refuse a frame of another camera, of an earlier time, or with impossible depths.
             self._check(frame)
-            self._recorder.record_frame(frame.timestamp_s, frame.rgb)
+            if self._recorder is not None:
+                self._recorder.record_frame(frame.timestamp_s, frame.rgb)
             # 2. Choose the tracker with the first frame, and add the frame's IMU samples.
             tracker = self._tracker_for(frame)
             if self._imu is not None and frame.imu is not None:
@@ -474,7 +475,8 @@ class Mapper:
         report = self.report()
         points, colours = self.map.points(min_readings=self._min_readings)
         report["map_points"] = len(points)
-        self._recorder.record_map(points)
+        if self._recorder is not None:
+            self._recorder.record_map(points)
         # 3. Write the files of segment 0, then those of the separate segments.
         is_metric = self.scale != _UP_TO_SCALE
         body = self.T_body_camera

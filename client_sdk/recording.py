@@ -1,22 +1,34 @@
-"""What a robot needs of the recorder of its messages, frames and maps; without one, nothing is kept."""
+"""Let a recorder see the messages, frames and maps of a robot: the one for files, or one of the program."""
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
-from client_sdk.network.message_tap import MessageTap, NullMessageTap
+from client_sdk.concurrency.user_callbacks import UserCallbacks
+from client_sdk.network.message_tap import MessageTap
 from rse_pf.config import SessionSettings
+from rse_pf.errors import UsageError
+from rse_pf.wire import Codec
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-__all__ = ["NullRobotRecorder", "RobotRecorder", "make_robot_recorder"]
+__all__ = ["RobotRecorder", "make_robot_recorder"]
+
+STOP_TIMEOUT_S = 5.0
+"""Longest time, seconds, for which the end of a robot waits for `RobotRecorder.stop` of the program."""
 
 
+@runtime_checkable
 class RobotRecorder(MessageTap, Protocol):
-    """Record one robot between `start` and `stop`; the methods between them return at once."""
+    """Record one robot between `start` and `stop`; the methods between them return at once.
+
+    A program extends this class, overrides the methods that it needs, and gives an object of it to
+    ``connect(record=...)``.  An exception is logged, and counted in `Stats.callback_errors`.
+    """
 
     def start(self) -> None:
         """Begin to record.
@@ -25,9 +37,11 @@ class RobotRecorder(MessageTap, Protocol):
             MissingExtra: A package for recordings is not installed.
             UsageError: Files cannot be written into the folder.
         """
+        return
 
     async def stop(self) -> None:
         """Write what is queued and finish the file."""
+        return
 
     def record_frame(
         self,
@@ -42,19 +56,40 @@ class RobotRecorder(MessageTap, Protocol):
             rgb: ``(h, w, 3)``, of which a thumbnail is recorded if thumbnails are on; None without an image.
             T_odom_camera: ``(4, 4)``, from the camera frame to the odometry frame, metres; None if unknown.
         """
+        return
 
     def record_map(self, points: npt.NDArray[np.float32]) -> None:
         """Record the points of a map, ``(n, 3)``, metres."""
+        return
 
 
-class NullRobotRecorder(NullMessageTap):
-    """Record nothing."""
+class _GuardedRecorder(RobotRecorder):
+    """Call a recorder of the program, so that the robot goes on whatever the recorder does."""
+
+    def __init__(self, recorder: RobotRecorder, callbacks: UserCallbacks) -> None:
+        self._recorder = recorder
+        self._callbacks = callbacks
 
     def start(self) -> None:
-        """Do nothing."""
+        self._callbacks.call("record.start", self._recorder.start)
 
     async def stop(self) -> None:
-        """Do nothing."""
+        try:
+            await asyncio.wait_for(self._recorder.stop(), STOP_TIMEOUT_S)
+        except Exception as error:  # noqa: BLE001  a function of the program may raise anything
+            self._callbacks.report("record.stop", error)
+
+    def open_connection(self, codec: Codec, token: str | None) -> int:
+        name, method = "record.open_connection", self._recorder.open_connection
+        number: int = self._callbacks.call(name, method, codec, token, default=0)
+        return number
+
+    def observe_message(self, connection: int, direction: Literal["up", "down"], data: bytes) -> None:
+        method = self._recorder.observe_message
+        self._callbacks.call("record.observe_message", method, connection, direction, data)
+
+    def close_connection(self, connection: int) -> None:
+        self._callbacks.call("record.close_connection", self._recorder.close_connection, connection)
 
     def record_frame(
         self,
@@ -62,26 +97,43 @@ class NullRobotRecorder(NullMessageTap):
         rgb: npt.NDArray[np.uint8] | None = None,
         T_odom_camera: npt.NDArray[np.float64] | None = None,
     ) -> None:
-        """Ignore a frame."""
+        method = self._recorder.record_frame
+        self._callbacks.call("record.record_frame", method, timestamp_s, rgb, T_odom_camera)
 
     def record_map(self, points: npt.NDArray[np.float32]) -> None:
-        """Ignore the points of a map."""
+        self._callbacks.call("record.record_map", self._recorder.record_map, points)
 
 
 def make_robot_recorder(
-    folder: str | Path | None, *, thumbnails: bool, session: SessionSettings, version: str
-) -> RobotRecorder:
-    """Return a recorder that writes into *folder*, or one that records nothing if *folder* is None.
+    record: str | Path | RobotRecorder | None,
+    *,
+    thumbnails: bool,
+    session: SessionSettings,
+    version: str,
+    callbacks: UserCallbacks,
+) -> RobotRecorder | None:
+    """Return the recorder of a robot, None if it records nothing.
 
     Args:
-        folder: For the files; made if it is missing.
-        thumbnails: Whether pictures of frames are recorded.
+        record: Folder for the files, made if it is missing; or a recorder of the program.
+        thumbnails: Whether pictures of frames are recorded in the folder.
         session: Limits of messages.
         version: Version of the SDK, which is written into the recording.
+        callbacks: Calls a recorder of the program, and survives its exceptions.
+
+    Raises:
+        UsageError: *record* is something else.
     """
-    if folder is None:
-        return NullRobotRecorder()
+    if record is None:
+        return None
+    if not isinstance(record, str | Path):
+        if not isinstance(record, RobotRecorder):
+            raise UsageError(
+                f"record= is a {type(record).__name__}, neither a folder nor a recorder",
+                hint="give a folder, or an object of a class that extends client_sdk.RobotRecorder",
+            )
+        return _GuardedRecorder(record, callbacks)
     # The only import of an extension in the SDK, so that `record=` needs nothing but a folder from its user.
     from rse_pf.extensions.recording.robot_recorder import RobotRecorder as FileRecorder
 
-    return FileRecorder(folder, thumbnails=thumbnails, session=session, version=version)
+    return FileRecorder(record, thumbnails=thumbnails, session=session, version=version)

@@ -31,7 +31,7 @@ from client_sdk.offloading.burst_policy import check_burst_url
 from client_sdk.offloading.command_router import CallArguments, CommandRouter, OnProgress
 from client_sdk.offloading.local_services import LocalServices
 from client_sdk.offloading.offload_policy import CloudFirst
-from client_sdk.recording import make_robot_recorder
+from client_sdk.recording import RobotRecorder, make_robot_recorder
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, Unauthorized, UsageError, error_from_code
@@ -83,7 +83,7 @@ class Robot:
         wall_clock: Callable[[], float] = time.time,
         random: random_module.Random | None = None,
         on_change: OnChange = None,
-        record: str | Path | None = None,
+        record: str | Path | RobotRecorder | None = None,
         thumbnails: bool = False,
         burst_url: str | None = None,
     ) -> None:
@@ -110,8 +110,10 @@ class Robot:
             on_change: Function that is called with ``link-lost`` or ``refused`` and the reason, or with
                 ``link-back``, ``moved`` or ``stands-by`` and the name of a server.  An exception of it is
                 logged and counted in `Stats.callback_errors`.
-            record: Folder for a recording of the robot's messages, for rse-pf replay; None records nothing.
-            thumbnails: Whether the recording has small pictures of the frames of the robot's `mapper`.
+            record: Folder for a recording of the robot's messages, for rse-pf replay; or a `RobotRecorder` of
+                the program; None records nothing.
+            thumbnails: Whether the recording in the folder has small pictures of the frames of the robot's
+                `mapper`.
             burst_url: ``https://HOST/burst``, the function that answers while no server can, also before the
                 first connection.  None takes the address that the servers name, and "" uses no function.
 
@@ -132,10 +134,14 @@ class Robot:
         self._session = ClientSession(
             codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{installed_version()}"
         )
-        self._recorder = make_robot_recorder(
-            record, thumbnails=thumbnails, session=settings, version=installed_version()
-        )
         self.callbacks = UserCallbacks(settings.ping_timeout_s)
+        self._recorder = make_robot_recorder(
+            record,
+            thumbnails=thumbnails,
+            session=settings,
+            version=installed_version(),
+            callbacks=self.callbacks,
+        )
         self._connection = Connection(
             urls,
             token=token,
@@ -195,7 +201,8 @@ class Robot:
             UsageError: The enrolment file cannot be used.
         """
         try:
-            self._recorder.start()
+            if self._recorder is not None:
+                self._recorder.start()
             if self._enrolment is not None:
                 access = read_enrolment(self._enrolment)
                 urls = self._urls if self._urls != [""] else [access.url]
@@ -241,7 +248,8 @@ class Robot:
             self._data_client.close()
         if self._local is not None:
             self._local.close()
-        await self._recorder.stop()
+        if self._recorder is not None:
+            await self._recorder.stop()
 
     async def solve_pnp(
         self,
@@ -472,7 +480,8 @@ class Robot:
             frame: Image and time.
             T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame, metres; None records no pose.
         """
-        self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)
+        if self._recorder is not None:
+            self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)
 
     @property
     def connected(self) -> bool:

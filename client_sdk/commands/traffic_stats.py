@@ -65,8 +65,8 @@ class Stats:
         server: Name of the server that is connected now, empty without one.
         region: Address of the platform that is used now, empty without one.
         last_error: Last problem of the connection, empty without one.
-        callback_errors: Calls of the program's functions (*on_change*, *on_progress*, *token*) that raised or
-            took longer than ``session.ping_timeout_s``; the log names them.
+        callback_errors: Calls of the program's functions (*on_change*, *on_progress*, *token*, a recorder)
+            that raised or took longer than ``session.ping_timeout_s``; the log names them.
     """
 
     sent: int

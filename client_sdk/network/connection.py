@@ -65,7 +65,7 @@ from client_sdk.network.dial_errors import (
     revoked_token_error,
 )
 from client_sdk.network.handshake import Dialler, Token
-from client_sdk.network.message_tap import MessageTap, NullMessageTap
+from client_sdk.network.message_tap import MessageTap
 from client_sdk.network.region_choice import MAX_REGIONS, RegionChoice
 from client_sdk.network.region_sockets import Region, RegionSocket
 from rse_pf.errors import ConnectError, ProtocolError, RsePfError, UnsupportedProtocol, UsageError
@@ -160,7 +160,7 @@ class Connection:
             wall_clock: Unix seconds; the clock by which *token* signs.
             on_change: Function of the program that is notified when the connection changes.
             callbacks: Calls *on_change* and *token*, and survives their exceptions.
-            tap: Observes every message, for a recording; None observes nothing.
+            tap: Observes every message, such as a recorder, and raises nothing; None observes nothing.
 
         Raises:
             UsageError: An address is no WebSocket address or appears twice, or there are too many.
@@ -173,7 +173,7 @@ class Connection:
         self.last_error = ""
         self.refusal: RsePfError | None = None
         """The refusal of the first region while all regions refuse this robot, else None."""
-        self._tap = tap or NullMessageTap()
+        self._tap = tap
         self._session = session
         self._settings = session.settings
         self._timings = timings
@@ -505,7 +505,8 @@ class Connection:
         # 2. Start the tasks that read and write the socket; the first message is Hello.
         socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
-        socket.tap_number = self._tap.open_connection(self._session.codec, token)
+        if self._tap is not None:
+            socket.tap_number = self._tap.open_connection(self._session.codec, token)
         socket.tasks = [
             self._start_task(self._read_messages(socket)),
             self._start_task(self._write_messages(socket)),
@@ -543,7 +544,8 @@ class Connection:
             while True:
                 data = await socket.websocket.recv(decode=False)
                 self.bytes_in += len(data)
-                self._tap.observe_message(socket.tap_number, "down", data)
+                if self._tap is not None:
+                    self._tap.observe_message(socket.tap_number, "down", data)
                 self._receive(socket, data)
         except (ConnectionClosed, OSError):
             code = socket.websocket.close_code
@@ -604,7 +606,8 @@ class Connection:
                 while socket.state.outgoing:
                     data = socket.state.outgoing.pop(0)
                     self.bytes_out += len(data)
-                    self._tap.observe_message(socket.tap_number, "up", data)
+                    if self._tap is not None:
+                        self._tap.observe_message(socket.tap_number, "up", data)
                     await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
             return  # the reading task discards the socket, after it has read the messages that still arrive
@@ -671,7 +674,8 @@ class Connection:
         # 1. Forget the socket; the session keeps its unanswered commands.
         socket.has_ended.set()
         self._sockets.remove(socket)
-        self._tap.close_connection(socket.tap_number)
+        if self._tap is not None:
+            self._tap.close_connection(socket.tap_number)
         if self._session.current is socket.state and not self._is_closed:
             self._notify_change("link-lost", "closed")
         self._session.close_connection(socket.state)

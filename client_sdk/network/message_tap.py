@@ -1,5 +1,4 @@
-"""Let an observer see every message of a robot's connections, such as a recorder; the default sees
-nothing."""
+"""Let an observer see every message of a robot's connections, such as a recorder."""
 
 from __future__ import annotations
 
@@ -7,14 +6,14 @@ from typing import Literal, Protocol
 
 from rse_pf.wire import Codec
 
-__all__ = ["MessageTap", "NullMessageTap"]
+__all__ = ["MessageTap"]
 
 
 class MessageTap(Protocol):
     """Observe the messages of all connections of one robot.
 
-    `client_sdk.network.connection` calls the methods in its event loop, so they must return at once and
-    raise nothing.
+    The ``return`` in each body lets programs inherit the methods that they do not need.
+    `client_sdk.network.connection` calls the methods in its event loop, so they must return at once.
     """
 
     def open_connection(self, codec: Codec, token: str | None) -> int:
@@ -22,28 +21,15 @@ class MessageTap(Protocol):
 
         Args:
             codec: Decodes the messages of the connection.
-            token: Text of the token by which the robot authenticated itself, None without one.
+            token: Text of the token by which the robot authenticated itself, None without one.  It is a
+                secret, and is part of some messages.
         """
-        ...
-
-    def observe_message(self, connection: int, direction: Literal["up", "down"], data: bytes) -> None:
-        """Observe the bytes of one message: ``up`` from robot to server, ``down`` from server to robot."""
-        ...
-
-    def close_connection(self, connection: int) -> None:
-        """Observe that *connection* has ended."""
-        ...
-
-
-class NullMessageTap:
-    """Ignore all messages: the tap of a robot that nobody observes."""
-
-    def open_connection(self, codec: Codec, token: str | None) -> int:
-        """Return 0 for every connection."""
         return 0
 
     def observe_message(self, connection: int, direction: Literal["up", "down"], data: bytes) -> None:
-        """Ignore the bytes of a message."""
+        """Observe the bytes of one message: ``up`` from robot to server, ``down`` from server to robot."""
+        return
 
     def close_connection(self, connection: int) -> None:
-        """Ignore the end of the connection."""
+        """Observe that *connection* has ended."""
+        return
