@@ -340,7 +340,7 @@ class KeySet:
         return "issued-too-early" if claims.issued_s < self.valid_from_s(claims.robot) else ""
 
     def valid_from_s(self, robot: RobotId) -> float:
-        """Return the cut-off of *robot*: Unix seconds before which no token may be issued; 0 without one."""
+        """Return the Unix time of *robot* such that tokens issued earlier are refused; 0 if it has none."""
         return self._not_before.get((robot.tenant, robot.name), 0.0)
 
 

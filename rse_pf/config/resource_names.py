@@ -42,8 +42,8 @@ ROBOTS_PATH = "/ws"
 ROSBRIDGE_PATH = "/rosbridge"
 """Path at the load balancer to which rosbridge clients connect, if ``serving.rosbridge`` is set."""
 ROSBRIDGE_PORT = 8768
-"""Port of the rosbridge server on a backend server.  It is not 9090, the port of rosbridge_suite, which is
-often in use on a robot."""
+"""Port of the rosbridge server on a backend server, and the default of ``rse-pf rosbridge``, which may run on
+a robot.  It is not 9090, because rosbridge_suite often uses that port on robots."""
 KEYS_NAME = "keys.json"
 """Name of the object in the artifact bucket that holds the public key set."""
 ROBOTS_NAME = "control/robots.json"

@@ -141,7 +141,7 @@ class Handlers:
         return HttpReply(status=200, body=self._document)
 
     async def list_objects(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
-        """Reply with up to ``limit`` of the robot's objects, sorted by digest, from behind ``after`` on."""
+        """Reply with the robot's objects above the digest ``after``, at most ``limit``, sorted by digest."""
         text = request.query.get("limit", str(_MAX_PAGE_OBJECTS))
         limit = int(text) if text.isdecimal() and text.isascii() and len(text) < 6 else 0
         if not 1 <= limit <= _MAX_PAGE_OBJECTS:

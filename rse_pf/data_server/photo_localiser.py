@@ -151,5 +151,5 @@ class _Maps:
     def _superfluous(self) -> tuple[str, str, str]:
         """Return the key of the map to drop: of the tenant with most cached maps, the least recently used."""
         counts = Counter(tenant for tenant, _, _ in self._known)
-        # Of equal tenants `max` returns the first map, which was used least recently.
+        # Of several maps with the greatest count `max` returns the first, which was used least recently.
         return max(self._known, key=lambda key: counts[key[0]])

@@ -16,12 +16,13 @@ from rse_pf.identity import RobotId
 __all__ = ["BLOCK_S", "MAX_CRASHES", "WINDOW_S", "CrashRecord"]
 
 WINDOW_S = 300.0
-"""Longest time in seconds between two crashes of a robot that count together."""
+"""Longest time in seconds between the first and the second crash of a robot: after a longer time, the later
+crash counts as the first one."""
 MAX_CRASHES = 2
 """Number of crashes after which a robot is refused; a single crash may be an accident."""
 BLOCK_S = 60.0
-"""Seconds for which a robot is refused after its last crash, so that it crashes at most two processes a
-minute."""
+"""Seconds for which a robot is refused after its second crash (`MAX_CRASHES`).  Afterwards its crashes are
+counted from 0 again, so that it crashes at most two processes a minute."""
 _MAX_ROBOTS = 10_000
 """Most robots whose crashes are remembered; above that, the robot whose last crash is oldest is forgotten."""
 

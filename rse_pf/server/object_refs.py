@@ -190,7 +190,10 @@ class _Fields:
 
 
 def _shape(request_type: Any) -> Any:
-    """Return the shape of *request_type*, None if it contains no ``bytes``; computed once for each type."""
+    """Return the places where *request_type* declares ``bytes``; None if it declares none.
+
+    They are described by a shape, a tree of `_Bytes`, `_Each` and `_Fields`, which is made once for a type.
+    """
     return _cached_shape(request_type)
 
 
@@ -200,9 +203,10 @@ def _cached_shape(request_type: type[Any]) -> Any:
 
 
 def _shape_of(kind: Any, depth: int) -> Any:
-    """Return the shape of the msgspec type *kind*, None if it contains no ``bytes`` within *depth* levels.
+    """Return the places of ``bytes`` in the msgspec type *kind* as a shape (see `_shape`).
 
-    A union has the shape of its only member with ``bytes``; with several such members it has None.
+    Only *depth* levels of nested types are searched; the result is None if they contain no ``bytes``.  A
+    union has the shape of its only member with ``bytes``, and None if several members have ``bytes``.
     """
     known = msgspec.inspect
     if depth == 0:
@@ -240,7 +244,7 @@ def _references(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
 
 
 def _replace(shape: Any, value: Any, read: Callable[[Any], Any]) -> Any:
-    """Return a copy of *value* with `read(digest)` in place of each reference.
+    """Return a copy of *value* with `read(digest)` in each place of *shape* that has a reference.
 
     Parts in which the request type has no ``bytes`` are not copied.
     """

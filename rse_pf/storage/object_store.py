@@ -250,12 +250,20 @@ class MemoryStore:
 class DirectoryStore:
     """An `ObjectStore` of files below one folder, written by temporary file, fsync and rename.
 
+    Only `append` writes into the file itself, without fsync.
+
     The objects of a robot are in up to 256 folders by the first two digits of their digests, as
     ``objects/TENANT/ROBOT/+ab/DIGEST``, so that each page of a listing reads a few small folders only.
+    These folders, whose names begin with `_SHARD`, are not part of the names of the objects.
     """
 
     def __init__(self, folder: Path, reserve: DiskReserve | None = None) -> None:
-        """Store the folder, and create nothing; on a full disk `compare_and_swap` uses space of *reserve*."""
+        """Create nothing yet.
+
+        Args:
+            folder: Path of the folder, which need not exist.
+            reserve: Space that `compare_and_swap` uses on a full disk; None if there is none.
+        """
         self._folder, self._root = folder, str(folder)
         self._reserve = reserve
         self._measured: dict[str, tuple[int, Usage, _Names]] = {}

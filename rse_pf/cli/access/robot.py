@@ -130,7 +130,7 @@ def _tenant(request: _DisableRequest | AdoptRequest, access: AccessControlStore)
 def enrol(request: EnrolRequest, settings: PlatformSettings) -> None:
     """Enrol a robot with --public-key, the key that it made, or --out, a new key in a file for the robot.
 
-    A robot of the same tenant and name is replaced, and its key refused within 2 s.
+    A robot of the same tenant and name is replaced; if it had another key, that key is refused within 2 s.
     """
     if (request.public_key is None) == (request.out is None):
         raise UsageError(
@@ -189,7 +189,11 @@ def adopt(request: AdoptRequest, settings: PlatformSettings) -> None:
 
 
 def remove(request: RobotRequest, settings: PlatformSettings) -> None:
-    """Delete the public key of a robot."""
+    """Remove a robot from the roster, with its public key; raises UsageError if it is not enrolled.
+
+    Within 2 s the robot's own tokens are refused, and connections that they authenticated are closed.  Tokens
+    of ``rse-pf token issue`` stay valid: a platform key signed them.
+    """
     access = request.open_access_control(settings)
     tenant = _enrolled_tenant(request, access)
     enrolled = access.roster().find(tenant, request.robot)
@@ -206,7 +210,7 @@ def remove(request: RobotRequest, settings: PlatformSettings) -> None:
 
 
 def disable(request: _DisableRequest, settings: PlatformSettings) -> None:
-    """Refuse all tokens of a robot until it is enabled again."""
+    """Refuse all tokens of a robot until it is enabled again, and close its connections, within 2 s."""
     access = request.open_access_control(settings)
     robot, tenant, now = request.robot, _tenant(request, access), time.time()
     longest = max_token_s(settings)
@@ -222,7 +226,7 @@ def disable(request: _DisableRequest, settings: PlatformSettings) -> None:
 
 
 def enable(request: RobotRequest, settings: PlatformSettings) -> None:
-    """Accept the tokens of a disabled robot again."""
+    """Accept tokens of a disabled robot again: those that are issued from now on."""
     access, robot, now = request.open_access_control(settings), request.robot, time.time()
     tenant = choose_robot(
         robot,
@@ -254,7 +258,7 @@ def _public_key(path: Path) -> str:
 
 
 def set_quota(request: _QuotaRequest, settings: PlatformSettings) -> None:
-    """Set the bytes that an enrolled robot may store."""
+    """Set the bytes that an enrolled robot may store; all servers apply the limit within 2 s."""
     access = request.open_access_control(settings)
     tenant = _enrolled_tenant(request, access)
     quotas = read_quotas(request.quota)

@@ -343,7 +343,7 @@ def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 
 def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
-    """Leave a server --percent of its CPU time, until the time of --for is over or Ctrl-C."""
+    """Slow a server down to --percent of its CPU time, until the time of --for is over or Ctrl-C."""
     from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
@@ -366,7 +366,7 @@ def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 
 def _signal(request: _ServerRequest, number: signal.Signals, done: str) -> None:
-    """Send signal *number* to all processes of the server, and print *done* with their number."""
+    """Send signal *number* to all processes of the server; print *done* and how many processes these are."""
     from rse_pf.extensions.experiments.faults import faults
 
     server = faults.find_server(request.read_state(), request.server)
@@ -605,7 +605,8 @@ _QUIET = frozenset(
         "server-out", "standby-started",
     )
 )  # fmt: skip
-"""Events that the terminal does not show: another event of the same server follows at once."""
+"""Events that the terminal does not show.  Other lines of the terminal say nearly the same, for instance
+``server-ready`` for ``server-launched``, and ``drain-start`` or ``server-gone`` for ``server-out``."""
 
 ACTION = Action(
     default="start",

@@ -205,7 +205,10 @@ class LogFollower:
         return _all_files(self._folder)
 
     def _of(self, file: Path) -> list[LogLine]:
-        """Return the wanted lines of *file* after those that were read; an incomplete last line is kept."""
+        """Return the wanted lines that *file* got since the last call.
+
+        An incomplete last line is not returned before the call that reads its end.
+        """
         at, size = self._read.get(file, 0), _size(file)
         if size < at:  # the log was rotated, or begun again by a new process of the same name
             at, self._rest[file] = 0, b""

@@ -55,7 +55,7 @@ class _BoardRequest:
     )
 
     def read_board(self) -> Board:
-        """Return the board of the options, by default 9x6 inner corners and 25 mm; raises UsageError."""
+        """Return the board of the options (default: 9x6 inner corners, 25 mm squares); raises UsageError."""
         from client_sdk.cameras.board import Board
 
         return Board.parse(self.board or "9x6", 25.0 if self.square_mm is None else self.square_mm)

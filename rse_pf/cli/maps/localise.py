@@ -326,7 +326,11 @@ def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Ca
 
 
 def _location_document(label: str, location: PhotoLocation) -> dict[str, Any]:
-    """Return the result for a frame as plain JSON values, with position (m), rotation and angle (deg)."""
+    """Return the fields of *location* as plain JSON values, with *label* as ``frame`` and the pose in parts.
+
+    The parts are the position of the camera in the map (``position_m``), its rotation (``quaternion_xyzw``),
+    and the angle of that rotation, 0 to 180 degrees (``turned_deg``).  They are None if no pose was found.
+    """
     T = None if location.T_map_camera is None else np.array(location.T_map_camera)
     return {
         "frame": label, **msgspec.structs.asdict(location),

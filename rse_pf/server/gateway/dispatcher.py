@@ -200,7 +200,12 @@ class Dispatcher:
             queue.close()
 
     def _receive(self, connection: RobotConnection, session: ServerSession, data: bytes, now: float) -> None:
-        """Refuse one whole message, or decode it: a short one at once, a long one in the decoder thread."""
+        """Decode one whole message, and do what it asks for, such as to submit its command.
+
+        A short message is decoded at once, a long one in the decoder thread.  Two kinds of messages are
+        refused undecoded: those that `_refuse_unread` refuses for the robot's rate or the server's overload,
+        and long ones for which the decoder thread has too much to decode.
+        """
         if session.state == "open" and self._refuse_unread(connection, session, data, now):
             return
         state, suspicion = session.state, session.suspicion

@@ -266,8 +266,14 @@ class _JobRun:
     def _supervise(self, process: Child) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
         """Read from the process and renew the lease until the run ends; return why it ended.
 
-        That is: over (the process has answered or exited), lost (another worker has the lease), given-up,
-        cancelled, or late (after `MAX_JOB_S`).
+        The process may still run; the caller kills it.  The result is one of:
+
+        - over: the process has sent its final message, or has exited.
+        - lost: another worker has the lease.
+        - given-up: this worker gives the job up (`JobSignals.give_up`), so that another server can run it.
+        - cancelled: the robot cancelled the job, and the process exited without a final message, or did not
+          exit within `_KILL_AFTER_S`.
+        - late: `MAX_JOB_S` have passed.
         """
         serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
         began = clock()
@@ -304,7 +310,7 @@ class _JobRun:
             self._lease.renew(self._done, self._what)
 
     def _read(self, process: Child) -> None:
-        """Read the messages that have arrived from the process; report progress, keep the final answer."""
+        """Read what has arrived from the process: report progress, store the final message in ``_end``."""
         try:
             data = process.connection.recv(_READ_BYTES, socket.MSG_DONTWAIT)
         except BlockingIOError:

@@ -252,7 +252,7 @@ def _enable(hierarchy: Hierarchy) -> None:
     has_parent = (folder / "cgroup.type").exists()
     if has_parent:
         if not _is_delegated(folder):
-            raise PermissionError(f"{folder} is not delegated")
+            raise PermissionError(f"systemd has not delegated the cgroup {folder}")
         server = folder / _SERVER_GROUP
         server.mkdir(exist_ok=True)
         for pid in _words(folder / "cgroup.procs"):

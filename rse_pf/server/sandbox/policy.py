@@ -514,10 +514,11 @@ class SandboxPolicy:
         return max(in_grace, key=lambda robot: self._held_by_tenant[robot.tenant], default=None)
 
     def _may_create(self, tenant: str, now: float) -> bool:
-        """Return whether a place for a sandbox is free for *tenant*.
+        """Return whether *tenant* may use a free place for a sandbox now.
 
-        While a place is kept for another tenant, *tenant* cannot have the last free place if it has more
-        sandboxes than that tenant.  If *tenant* is the one that the place is kept for, keeping ends.
+        While a place is kept for ``_next_tenant``, another tenant with more sandboxes than ``_next_tenant``
+        may not use the last free place.  If *tenant* is ``_next_tenant`` and a place is free, the result is
+        True, and no place is kept any longer; if none is free, a place stays kept until ``_next_until_s``.
         """
         free = self._max_sandboxes - len(self._sandboxes)
         if tenant == self._next_tenant and free:
@@ -525,7 +526,7 @@ class SandboxPolicy:
         return free > (now < self._next_until_s and self._holds_more(tenant, 1))
 
     def _holds_more(self, tenant: str, more: int) -> bool:
-        """Return whether *tenant* has *more* or more sandboxes above the number of ``_next_tenant``."""
+        """Return whether *tenant* has at least *more* sandboxes more than ``_next_tenant`` has."""
         return self._held_by_tenant[tenant] >= self._held_by_tenant[self._next_tenant] + more
 
     def _no_place_error(self) -> Busy:

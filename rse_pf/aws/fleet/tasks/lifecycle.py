@@ -49,9 +49,10 @@ class _Lifecycle:
             self._join(target)
 
     def _join(self, target: str) -> None:
-        """Complete the launch hook with CONTINUE if the server is ready, with ABANDON after the time limit.
+        """Complete the launch hook with CONTINUE if the server is ready, with ABANDON after `ready_within_s`.
 
-        Before either, only wait.  After CONTINUE the phase is SERVING, or WARMED in the warm pool.
+        Before that time, a call with a server that is not ready does nothing.  After CONTINUE, or if the hook
+        did not wait for this instance, the phase is SERVING, or WARMED in the warm pool.
         """
         context, state = self._context, self._context.state
         if state.phase is Phase.WARMED:
@@ -70,7 +71,11 @@ class _Lifecycle:
         context.log(event, target=target, after_s=round(age_s, 1), hook=did_wait)
 
     def _leave_group(self) -> None:
-        """Drain the server, once, and complete the termination hook as soon as the hook waits."""
+        """Drain the server, then complete the termination hook.
+
+        The first call drains, and blocks until the server has exited or the time for that is over.  If the
+        hook does not wait for this instance yet, the next call tries to complete it again.
+        """
         context = self._context
         context.state.phase = Phase.LEAVING
         if self._drained is None:

@@ -36,7 +36,8 @@ __all__ = ["NOTE_ALL_LEFT", "NOTE_CHANGED", "NOTE_UNUSED", "Publisher", "read_st
 NOTE_ALL_LEFT = "the last robot left"
 """Note of a version that is published because all robots have left the live map."""
 NOTE_CHANGED = "live map"
-"""Note of a version that is published because the map has changed since the version 10 minutes before."""
+"""Note of a version that a map server publishes by itself: every 10 minutes, if the map has changed since the
+last version."""
 NOTE_UNUSED = "nobody used the live map"
 """Note of a version that is published because the live map is not used and is given up."""
 _AUTOMATIC_NOTES = (NOTE_ALL_LEFT, NOTE_CHANGED, NOTE_UNUSED)
