@@ -29,13 +29,14 @@ from tests.kit.two_views import make_two_views
 __all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]
 
 CORPUS = Path(__file__).parent / "corpus"
+"""Folder of stored inputs, in a folder for each target."""
 MAX_INPUT_BYTES = 262_144
 """``session.max_message_bytes``: longer messages never reach a decoder."""
 
 
 @cache
 def samples(target: str) -> tuple[bytes, ...]:
-    """Return the initial inputs of *target*, its corpus last."""
+    """Return the initial inputs of *target*: those made here, then the files of its folder in `CORPUS`."""
     kept = [file.read_bytes() for file in sorted((CORPUS / target).glob("*"))]
     return (*_MADE[target](), *kept)
 

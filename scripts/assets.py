@@ -48,7 +48,8 @@ APIS = (
     "autoscaling", "cloudwatch", "cloudformation", "ec2", "elbv2", "lambda", "logs", "s3", "secretsmanager",
     "sns", "sqs", "ssm", "sts",
 )  # fmt: skip
-"""Of botocore's descriptions of 400 services those that a server may call; all are 30 MB in 2,000 files."""
+"""AWS services that a server may call: it gets botocore's descriptions of these alone.  The descriptions of
+all 400 services are 30 MB in 2,000 files."""
 DEBIAN_12 = ("3.11", 36)
 AMAZON_2023 = ("3.13", 34)
 FUNCTION_FOLDER = "/var/task"
@@ -56,7 +57,7 @@ FUNCTION_FOLDER = "/var/task"
 ENVIRONMENT = "/opt/rse-pf/venv"
 """Where a server unpacks its environment: stacks/boot/install.py."""
 LIBRARIES = ("libraries-0.tar.gz", "libraries-1.tar.gz")
-"""Two of about the same size: a server unpacks both at the same time."""
+"""Archives of about the same size, which a server unpacks at the same time."""
 PLATFORM, ENVIRONMENT_FILE = "platform.tar.gz", "environment.json"
 NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "*.py", "Makefile", "*.toml", "*.md")
 
@@ -261,7 +262,7 @@ def _halves(tree: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _write_scripts(site: Path, folder: Path) -> None:
-    """Write the commands that our wheels declare, as an installer would."""
+    """Write to *folder* a script for each command that a wheel in *site* declares, as an installer does."""
     for declared in sorted(site.glob("*.dist-info/entry_points.txt")):
         points = configparser.ConfigParser()
         points.read(declared, encoding="utf-8")

@@ -20,10 +20,12 @@ from tests.kit.inertial_drive import InertialDrive, Motion
 
 __all__ = ["CheckedDrive", "recorded_drive", "rendered_drive"]
 
+# Rates of frames and of odometry; way of a drive on wheels between two frames, metres.
 RATE_HZ, _ODOMETRY_HZ, _STEP_M = 10.0, 20.0, 0.034
 _SCALE, _NOISE_M, _NOISE_RAD = 0.003, 0.0005, 0.0004
-"""Of odometry: relative error of its scale, and noise of each of its steps."""
-_BASELINE_M = 0.11
+"""Standard deviations of an odometry's errors: of its scale (relative), and of each of its steps (metres,
+radians)."""
+_BASELINE_M = 0.11  # distance of the two cameras of a stereo pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,6 +81,7 @@ def odometry_of(truth: Trajectory, seed: int) -> Trajectory:
 
 
 def _wheels(seed: int, poses: int) -> Trajectory:
+    """Return the path of a camera on wheels, *poses* poses of the loop through the rooms, as of `_hand`."""
     rng = np.random.default_rng([seed, 43])
     path = loop_trajectory(
         float(rng.uniform(0.0, 28.0)), poses, seed, step_m=_STEP_M * RATE_HZ / _ODOMETRY_HZ
@@ -87,7 +90,12 @@ def _wheels(seed: int, poses: int) -> Trajectory:
 
 
 def _hand(seed: int, poses: int) -> Trajectory:
-    """Return the path of a camera that moves about a point of the middle room, as `InertialDrive` does."""
+    """Return the path of a hand-held camera that stays near one point of the middle room of `make_world`.
+
+    Translation and rotation are sums of slow sines (`InertialDrive`): about 0.5 m at most from the mean
+    position, which is in the middle of the room, and about 0.5 rad from the first orientation.  *poses* is
+    the number of poses, at the rate of the odometry.
+    """
     model = ImuModel(
         T_imu_camera=np.eye(4), gyro_noise=1e-3, gyro_walk=1e-5, accel_noise=1e-2, accel_walk=1e-4,
         rate_hz=200.0,

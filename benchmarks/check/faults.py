@@ -21,19 +21,25 @@ from rse_pf.geometry import Camera
 
 __all__ = ["FAULTS", "Fault"]
 
-_DARK_BRIGHTNESS = 12.0
+_DARK_BRIGHTNESS = 12.0  # brightness that replaces 255 in a dark image
 _STRETCH = 10
-"""Frames of a stretch that is dark, or of one of two cameras."""
+"""Number of frames in a row that are of one of two cameras; half the period of light and dark frames."""
 
 Plant = Callable[[Iterable[Frame]], Iterator[Frame]]
+"""Plants a fault: returns the frames of a drive with the fault."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """One fault at one of three severities.
+    """One fault at one severity.
 
-    ``value`` is what a finding should say, None where only its kind counts; ``needs`` is empty, ``depth``,
-    ``odometry`` or ``stereo``.
+    Attributes:
+        name: Name of the series of faults, and the number of the severity, such as ``fx-1``.
+        kind: The kind that a finding has to name.
+        value: The value that a finding has to state, in the unit of its kind; None if only the kind counts.
+        plant: Plants the fault into the frames of a drive.
+        needs: What a drive needs for the fault to be found, ``depth``, ``odometry`` or ``stereo``; empty if
+            nothing.
     """
 
     name: str
@@ -74,7 +80,7 @@ def _remapped(frame: Frame, x: npt.NDArray[np.float32], y: npt.NDArray[np.float3
 
 
 def _distorted(k1: float) -> Plant:
-    """Return frames as a lens with *k1* gives them, magnified so far that no border is empty."""
+    """Plant the distortion *k1* of a lens; images are magnified so far that no border is empty."""
 
     def change(frame: Frame) -> Frame:
         camera = frame.camera
@@ -96,7 +102,7 @@ def _distorted(k1: float) -> Plant:
 
 
 def _zoomed(frame: Frame, zoom: float) -> Frame:
-    """Return what a camera with *zoom* times the focal length sees."""
+    """Return the frame of a camera with *zoom* times the focal length; its intrinsics do not change."""
     camera = frame.camera
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     x = (columns - np.float32(camera.cx)) / np.float32(zoom) + np.float32(camera.cx)
@@ -105,7 +111,10 @@ def _zoomed(frame: Frame, zoom: float) -> Frame:
 
 
 def _two_cameras(zoom: float, stretch: int | None) -> Plant:
-    """Return frames of two cameras with one calibration: in stretches, or the second half."""
+    """Plant frames of a second camera, of *zoom* times the focal length, under the calibration of the first.
+
+    They are every second *stretch* of frames, or the second half of the drive if *stretch* is None.
+    """
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         every = list(frames)
@@ -134,7 +143,10 @@ def _depth(scale: float, offset_m: float) -> Plant:
 
 
 def _late_depth(delay_s: float) -> Plant:
-    """Return frames whose depth is that of the frame nearest to *delay_s* earlier."""
+    """Plant a delay of depth: each frame gets the depth of the frame nearest to *delay_s* before it.
+
+    The first frames, which have no such frame, are left out.
+    """
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         earlier: deque[tuple[float, npt.NDArray[np.float32]]] = deque()
@@ -154,7 +166,7 @@ def _stamped(delay_s: float) -> Plant:
 
 
 def _some(change: Callable[[Frame, npt.NDArray[np.uint8] | None], Frame], every: int) -> Plant:
-    """Return frames of which each *every*-th is changed; *change* gets the image before it."""
+    """Change each *every*-th frame; *change* gets the frame, and the image before it (None for the first)."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         before: npt.NDArray[np.uint8] | None = None
@@ -181,7 +193,7 @@ def _repeated(every: int) -> Plant:
 
 
 def _dark(share: float) -> Plant:
-    """Return frames of which a share, in stretches, has a twentieth of the light."""
+    """Give the first *share* of every 2 * `_STRETCH` frames a twentieth of the light."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         for row, frame in enumerate(frames):
@@ -194,12 +206,12 @@ def _dark(share: float) -> Plant:
 
 
 def _missing(*rows: int) -> Plant:
-    """Return frames of which these of each ten are missing."""
+    """Leave out these *rows* (0 to 9) of each ten frames."""
     return lambda frames: (frame for row, frame in enumerate(frames) if row % 10 not in rows)
 
 
 def _jittered(share: float) -> Plant:
-    """Return frames whose stamps are moved by up to a share of the interval, either way."""
+    """Move each time stamp by up to *share* of the median interval, either way."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         every, rng = list(frames), np.random.default_rng(6)
@@ -232,7 +244,7 @@ def _baseline(share: float) -> Plant:
 
 
 def _shifted(offset_px: float) -> Plant:
-    """Return pairs whose right images lie to the right, so that disparities are smaller."""
+    """Shift right images by *offset_px* to the right, so that disparities are smaller by as much."""
     moved = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, 0.0]])
 
     def change(frame: Frame) -> Frame:
@@ -255,6 +267,8 @@ def _swapped(frame: Frame) -> Frame:
 
 
 def _listed() -> Iterator[Fault]:
+    """Yield all faults: one series after the other, its severities numbered from 1."""
+
     def three(
         kind: FaultKind, name: str, faults: list[tuple[float | None, Plant]], needs: str = ""
     ) -> Iterator[Fault]:
@@ -302,4 +316,5 @@ def _listed() -> Iterator[Fault]:
 
 
 FAULTS: tuple[Fault, ...] = tuple(_listed())
-"""Each of the kinds at three severities; faults of one kind are told apart by their names."""
+"""Faults in series of three severities each; swapped cameras have one severity only.  A kind may have several
+series: ``fx`` is a wrong fx alone, ``f`` a wrong fx and fy."""

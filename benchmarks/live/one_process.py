@@ -58,7 +58,15 @@ FOREIGN = ("redwood_living_room", "nyu_dining_room", "tum_fr1_xyz_start", "7scen
 
 @dataclass(slots=True, eq=False)
 class Played:
-    """What robots in one live map got: poses as given out, the frame of each join, and the map at the end."""
+    """A live map at the end of its drives, and what its robots were sent.
+
+    Attributes:
+        live_map: The map.
+        ids: The ids of the keyframes of each robot, in the order of sending.
+        given: ``T_map_camera`` as each robot knew it while it drove, by frame; without the frames before it
+            was joined.
+        outcomes: All outcomes of the events, in order.
+    """
 
     live_map: LiveMap
     ids: dict[str, list[int]] = field(default_factory=dict)
@@ -66,13 +74,13 @@ class Played:
     outcomes: list[Outcome] = field(default_factory=list)
 
     def online_cm(self, truth: Mapping[str, Array]) -> float:
-        """Return the error of the poses as they were given out."""
+        """Return the ATE, cm, of the poses as the robots knew them while they drove."""
         rows = {name: sorted(errors_cm) for name, errors_cm in self.given.items() if errors_cm}
         given = np.array([self.given[name][row] for name in rows for row in rows[name]])
         return 100.0 * ate_m(given, np.concatenate([truth[name][rows[name]] for name in rows]))
 
     def final_cm(self, runs: Mapping[str, Run], truth: Mapping[str, Array]) -> float:
-        """Return the error of all frames in the map at the end."""
+        """Return the ATE, cm, of all frames with the poses of the keyframes at the end."""
         poses = [
             frame_poses(run, np.array([self.live_map.pose(i) for i in self.ids[name]]))
             for name, run in runs.items()
@@ -80,12 +88,15 @@ class Played:
         return 100.0 * ate_m(np.concatenate(poses), np.concatenate([truth[name] for name in runs]))
 
     def joined_at(self) -> dict[str, int]:
-        """Return the own frame from which on each robot knew its place."""
+        """Return the first frame of each robot, in its own count, of which it knew the pose in the map."""
         return {name: min(frames) for name, frames in self.given.items() if frames}
 
 
 def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:
-    """Return ``(n, 2)`` positions, a step apart, on a way to and fro that never comes back."""
+    """Return positions ``(n, 2)``, m, `STEP_M` apart, on *rows* parallel lines of *length_m* in turn.
+
+    The lines are *apart_m* from each other, so that the way never comes back to a place.
+    """
     corners: list[tuple[float, float]] = []
     for row in range(rows):
         ends = (x, x + length_m) if row % 2 == 0 else (x + length_m, x)
@@ -121,7 +132,11 @@ def play(runs: Mapping[str, Run], starts: Mapping[str, int]) -> Played:
 
 
 def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[tuple[int, str, Array | None]]:
-    """Send a keyframe, measure it, and return what robots learn of it, and when."""
+    """Send a keyframe, measure its loop closures, and return the alignments that robots get from it.
+
+    An alignment is the tick at which a robot gets it, the robot, and its ``T_map_odom``, None if the robot is
+    not joined any more.
+    """
     keyframe = run.version.keyframes[number]
     event = KeyframeAdded(
         robot=name, segment=0, number=number, data=encode_keyframe(SentKeyframe.from_map(keyframe))
@@ -184,7 +199,11 @@ def _plant(seed: int) -> int:
 def _make(
     world: GeneratedWorld, drives: Sequence[GeneratedDrive], ms: list[float] | None = None
 ) -> tuple[list[Event], LiveMap]:
-    """Return the log of generated drives, with whole optimisations, and the map."""
+    """Apply the events of generated drives to a new live map; return the log of all events, and the map.
+
+    Whenever the map wants an optimisation, it is made at once, and its event is in the log.  The CPU time of
+    each event of the drives, milliseconds, is appended to *ms*; that of the optimisations is not.
+    """
     live_map = LiveMap()
     log: list[Event] = []
     for event in world.play(list(drives)):
@@ -278,7 +297,11 @@ def wrong_links(runs: int) -> dict[str, Any]:
 
 
 def twins(runs: int) -> dict[str, Any]:
-    """Return what becomes of robots in two rooms that look the same, which the map may know of."""
+    """Return how often robots in two rooms that look the same are joined wrongly.
+
+    The rooms are 10 m apart.  The map is told a size of 4 m of rooms that look the same, or 0: every place
+    is unique (`MapStarted.equal_rooms_m`).
+    """
     return {
         f"{told_m:g} m stated": {
             "one robot in each room": _twins(runs, told_m, drives_across=False),
@@ -290,7 +313,7 @@ def twins(runs: int) -> dict[str, Any]:
 
 
 def _one_building(runs: int, told_m: float) -> dict[str, Any]:
-    """Return when two robots that drive the same way of 9 m through unique rooms are joined."""
+    """Return after how many metres two robots that drive the same 9 m through unique rooms are joined."""
     at_m = []
     for seed in range(runs):
         world = GeneratedWorld(seed=seed, links=2)
@@ -322,7 +345,10 @@ def _twins(runs: int, told_m: float, *, drives_across: bool) -> dict[str, int]:
 
 
 def replay() -> dict[str, Any]:
-    """Return the time of a replay of 2,000 keyframes with measured links, and whether it is the same map."""
+    """Return the CPU seconds of a replay of 2,000 keyframes, and whether it gives the same map to the byte.
+
+    The log, which contains the measured loop closures, is replayed from an empty map and from a snapshot.
+    """
     world = GeneratedWorld(seed=1)
     drives = [world.drive(f"robot-{i}", circle(8.0, 0.8, 2.0 * i)[:400]) for i in range(5)]
     log, live_map = _make(world, drives)
@@ -342,7 +368,14 @@ def replay() -> dict[str, Any]:
 
 
 def growth(keyframes: int) -> dict[str, Any]:
-    """Return the cost of a keyframe in a map that grows, wide and revisiting."""
+    """Return the CPU time of a keyframe in two maps that grow to *keyframes* keyframes, one drive each.
+
+    The drive of ``wide`` never comes back to a place; that of ``revisiting`` goes round a circle of 3 m
+    radius again and again.  The time is that of adding a keyframe and its loop closures, without
+    optimisations.  ``late_ms`` is that of the last tenth of the keyframes, milliseconds; ``times_a_tenth`` is
+    the ratio of its percentiles to those when the map had a tenth of its keyframes.  ``kept`` is the number
+    of keyframes in the map at the end; ``peak_gib`` is the peak memory of this process until then.
+    """
     rows = {}
     for what, way in (
         ("wide", meander(50.0, keyframes // 500 + 2)),

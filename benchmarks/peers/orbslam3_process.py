@@ -22,11 +22,12 @@ import cv2
 import numpy as np
 import pyorbslam3
 
+# Checks in a row that have to find all threads idle, and longest wait for that, seconds.
 RESTS, LONGEST_REST_S = 3, 1.0
 
 
 def run_job(job_path):
-    """Run the job."""
+    """Feed the frames of the job in the file *job_path* to ORB-SLAM3, and write the files of results."""
     job = json.loads(Path(job_path).read_text())
     out = Path(job["out"])
     sensor = pyorbslam3.Sensor.__members__[job["sensor"]]
@@ -77,7 +78,11 @@ def run_job(job_path):
 
 
 def wait_until_all_rest():
-    """Wait until no other thread of this process runs or wants to, in several looks in a row."""
+    """Wait until no other thread of this process runs or waits for a processor, but at most one second.
+
+    Threads are checked every 4 ms, and have to be idle in three checks in a row.  After one second the
+    function returns although threads still run.
+    """
     looks, end = 0, time.monotonic() + LONGEST_REST_S
     while looks < RESTS and time.monotonic() < end:
         time.sleep(0.004)
@@ -85,7 +90,7 @@ def wait_until_all_rest():
 
 
 def is_running(task):
-    """Say whether a thread other than this one runs or waits for a processor."""
+    """Return whether *task* (in /proc/self/task) is another thread that runs or waits for a processor."""
     try:
         state = (task / "stat").read_text().rpartition(")")[2].split()[0]
     except OSError:

@@ -50,19 +50,23 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "max_unauthenticated": 2000, "max_unauthenticated_per_source": 0,
     },
 }  # fmt: skip
-"""Robots of a measurement come from few addresses and all at once; every other limit is the default."""
+"""Settings of the server: a limit of 0 is off.  All robots of a measurement come from few addresses and at
+once; every other limit is the default."""
 
 FRAMES_PER_S = 5.0
-"""The paper's rate (Sect. 6.2)."""
+"""Frames that each robot sends in a second: the rate of the paper (Sect. 6.2)."""
+# Largest p99 of the latency, ms, at which robots count as carried; fewest robots that two workers have to
+# carry; largest memory of a connected robot, KiB.
 P99_BAR_MS, ROBOTS_BAR, KIB_BAR = 150.0, 1000, 16.0
+# Robots of the first step of a search, and largest number that is tried.
 FIRST, MOST = 250, 8000
-PRECISION = 1.07
-CONNECTED = 10_000
+PRECISION = 1.07  # a search ends at this ratio of the fewest robots that failed to the most that were carried
+CONNECTED = 10_000  # robots that are connected after the searches
 CONNECTED_TO_ONE_ACTIVE = 20  # of 10,000 connected robots 500 are active
-PING_EVERY_S = 2.0
-SOURCES = 8
-WARM_UP_S = 1.0
-DRAIN_S = 1.0
+PING_EVERY_S = 2.0  # time between two pings of a robot that is not active
+SOURCES = 8  # addresses from which the robots connect
+WARM_UP_S = 1.0  # time at the beginning of a step that is not measured
+DRAIN_S = 1.0  # time after a step in which answers still count
 SEARCH_S = 85.0  # no step begins after this time of a search
 
 
@@ -78,7 +82,7 @@ class ServingSite:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CapacityStep:
-    """What came of one number of robots."""
+    """The result of one step: how many commands of *robots* robots were answered, and how fast."""
 
     robots: int
     ok: int
@@ -98,7 +102,7 @@ class CapacityStep:
 
 
 def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: float) -> CapacityStep:
-    """Connect *robots*, let them send, return what came of it."""
+    """Connect *robots* robots to *site*, let them send frames for *seconds*, and return the result."""
     scenario = LoadScenario(robots=robots, fps=FRAMES_PER_S, seconds=seconds, codec=codec)
     plan = replace(
         plan_of(scenario, folder, site.port), path=site.path, tokens=site.tokens, sources=SOURCES,
@@ -116,7 +120,15 @@ def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: floa
 def search(
     try_robots: Callable[[int], CapacityStep], clock: Callable[[], float], search_s: float
 ) -> list[CapacityStep]:
-    """Return every step on the way to the most robots that are carried; a failed step is tried twice."""
+    """Search the largest number of robots that is carried; return all steps in their order.
+
+    The number is doubled from `FIRST` until a step fails twice, then bisected to `PRECISION`.
+
+    Args:
+        try_robots: Makes a step with a number of robots.
+        clock: Returns seconds.
+        search_s: No step begins later than this time, seconds, after the start.
+    """
     steps: list[CapacityStep] = []
     until = clock() + search_s
 
@@ -144,7 +156,19 @@ def search(
 
 
 def most_robots(workers: int, codec: str, seconds: float, search_s: float) -> dict[str, Any]:
-    """Search directly, without a balancer."""
+    """Return the most robots that a server of *workers* processes carries, connected without a balancer.
+
+    Robots are carried if each of their commands returned a pose, with a p99 of at most `P99_BAR_MS`.
+
+    Args:
+        workers: Worker processes of the server.
+        codec: Codec of the messages: zlib, json or bin.
+        seconds: Duration of each step of the search.
+        search_s: No step begins later than this time, seconds, after the start of the search.
+
+    Returns:
+        See `find_capacity`.
+    """
     with serving(workers) as (server, folder):
         site = ServingSite(port=server.port, path="/ws", workers=workers)
         return find_capacity(site, folder, codec, seconds, search_s)
@@ -153,7 +177,10 @@ def most_robots(workers: int, codec: str, seconds: float, search_s: float) -> di
 async def most_robots_behind_balancer(
     servers: int, codec: str, seconds: float, search_s: float
 ) -> dict[str, Any]:
-    """Search through Envoy, with one server of one worker for each of *servers*."""
+    """Return the same as `most_robots` for robots that connect through Envoy, with tokens.
+
+    Behind Envoy are *servers* servers of one worker each.
+    """
     settings = PlatformSettings.from_dict({"serving": SETTINGS["serving"]})
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
@@ -168,7 +195,10 @@ async def most_robots_behind_balancer(
 def find_capacity(
     site: ServingSite, folder: Path, codec: str, seconds: float, search_s: float = SEARCH_S
 ) -> dict[str, Any]:
-    """Return the most robots that *site* carries, and all steps."""
+    """Return the most robots that *site* carries (``robots``, 0 for none), ``workers``, and all ``steps``.
+
+    *seconds* and *search_s* are as in `most_robots`.
+    """
     step(site, folder, codec, 20, 1.0)  # warms it up
     steps = search(lambda robots: step(site, folder, codec, robots, seconds), time.monotonic, search_s)
     most = max((tested.robots for tested in steps if tested.is_carried), default=0)
@@ -176,7 +206,11 @@ def find_capacity(
 
 
 def measure_connected(codec: str, seconds: float, connected: int) -> dict[str, Any]:
-    """Return what *connected* robots, of which one in twenty is active, need and see."""
+    """Connect *connected* robots to a server of two workers; return its memory and CPU, and their answers.
+
+    One robot in twenty is active and sends one frame a second; the others send a ping every 2 s.  The load
+    is measured for *seconds*.
+    """
     active = connected // CONNECTED_TO_ONE_ACTIVE
     memory: dict[str, int] = {}
     cpu: dict[str, float] = {}
@@ -237,7 +271,7 @@ def run_benchmark(
     seconds: Annotated[float, "of each step"] = 5.0,
     search_s: Annotated[float, "no step of a search begins after this time"] = SEARCH_S,
 ) -> dict[str, Any]:
-    """Search, then connect all that are mostly idle."""
+    """Search the most robots for each number of workers, then connect robots that are mostly idle."""
     compile_generator()
     searches = []
     for count in workers:

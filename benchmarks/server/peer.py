@@ -48,7 +48,7 @@ from rse_pf.pnp.problems import make_problem
 
 WORKERS = 2
 FRAMES_PER_S = 5.0
-"""The paper's rate (Sect. 6.2)."""
+"""Frames that each of the `MANY` robots sends in a second: the rate of the paper (Sect. 6.2)."""
 MANY = 100
 OUTLIERS = (0.3, 0.5)
 PEER, ZLIB, BINARY = "peer", "zlib", "bin"

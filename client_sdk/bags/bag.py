@@ -69,13 +69,15 @@ _USUAL_DEPTH_SCALE = 1000.0  # units per metre of 16-bit depth if nothing is sta
 # Largest difference of focal lengths and principal points, as a share of the image's size, of two cameras
 # with the same view.
 _MAX_VIEW_DIFFERENCE = 0.01
-# Largest number of changes of the stated camera that are compared with images; an autofocus causes many.
+# Largest number of changes of the calibration in ``CameraInfo`` that are compared with the images before and
+# after them; an autofocus causes many.
 _MAX_CHECKED_CHANGES = 5
-# Smallest difference of the errors in the images, px, with a stated change of the camera and without it, at
-# which the images contradict the change.
+# The images before and after a change of the calibration in ``CameraInfo`` contradict the change if their
+# error (`mismatch_px`) with the change exceeds that without it by more than this, px, and by more than the
+# factor `_MIN_MISMATCH_RATIO`.
 _MIN_MISMATCH_PX = 3.0
-# Smallest ratio of the errors in the images, with a stated change of the camera and without it, at which the
-# images contradict the change.
+# Ratio of the error with the change of the calibration to that without it above which images contradict the
+# change, if `_MIN_MISMATCH_PX` is exceeded as well.
 _MIN_MISMATCH_RATIO = 2.0
 _ESTIMATED_FRAMES = {"odom", "map"}
 """Root frames of tf whose poses come from an odometry or another SLAM system, and are no ground truth."""
@@ -387,7 +389,7 @@ def _change_doubts(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> 
 
 
 def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None:
-    """Compare the images before and after each stated change of the camera, up to five of them.
+    """Compare the images before and after the first five changes of the calibration in ``CameraInfo``.
 
     Raises:
         UsageError: The images show that the lens did not change: one of the two calibrations is wrong.
@@ -522,6 +524,9 @@ def _rectification(
 
     ``T_left_camera`` is the pose of the camera of the frames (the rectified left one) in the left camera of
     the bag; the identity for one camera.
+
+    Raises:
+        UsageError: The calibration of a camera of the pair is missing, changes, or is for another size.
     """
     if chosen.right is None:
         return None, np.eye(4)

@@ -23,8 +23,8 @@ _MAX_SAMPLES = 2_000_000
 _USUAL_NOISE = {"gyro_noise": 1e-3, "gyro_walk": 1e-4, "accel_noise": 6e-3, "accel_walk": 3e-3}
 """Noise that is assumed for an IMU whose noise is not stated, a small MEMS IMU as in depth cameras: four
 times the noise densities in the data sheet of Bosch's BMI055 (0.014 degree/s/sqrt(Hz), 150 ug/sqrt(Hz)),
-because a robot shakes.  The random walk of the accelerations is that of EuRoC's IMU, that of the rates five
-times it. Units are those of `RigImu`."""
+because a robot shakes.  The random walk of the accelerations is that of EuRoC's IMU, the random walk of the
+rates is five times that of EuRoC's.  Units are those of `RigImu`."""
 _HINT = "leave the IMU out with --no-imu, or give its place and noise with --intrinsics rig.json"
 
 

@@ -84,8 +84,7 @@ class CalibrationCheck:
         cannot_tell: Faults that the drive does not determine, with the reasons.
         noise_m: Uncertainty of the adjusted path, root mean square, metres; 0 if nothing was adjusted.
         scale_deviation: Relative standard deviation of the metric scale of the adjusted path that results
-        from
-            the uncertainty of the calibration; 0 if nothing was adjusted.
+            from the uncertainty of the calibration; 0 if nothing was adjusted.
         stamps_s: ``(k,)``, time stamps of the adjusted keyframes; empty if too few keyframes connect.
         T_world_camera: ``(k, 4, 4)``, poses of these keyframes with the corrected calibration, metres.
     """
@@ -274,10 +273,11 @@ class _Errors:
     camera: Camera
 
     def certain(self, kind: FaultKind) -> tuple[list[int], float]:
-        """Return the indices of a fault's unknowns that are certain, and its cost in metres.
+        """Return the indices of a fault's unknowns whose errors are certain, and the bend they cause, metres.
 
-        An unknown is certain above three standard deviations and above its entry of `_MIN_ERRORS`.  The list
-        is empty if the fault bends the path by less than `matters` requires; a delay of depth always counts.
+        An error is certain above three standard deviations and above its entry of `_MIN_ERRORS`.  The bend is
+        the root mean square change of the keyframes' positions, see `Calibrated.bend_m`.  The list is empty
+        if the bend is too small for `matters`, except for a delay of depth; the bend is returned in any case.
         """
         rows = [
             row
@@ -305,6 +305,7 @@ class _Errors:
         ]
 
     def worst(self, rows: list[int]) -> int:
+        """Return the one of *rows* whose error is largest relative to its standard deviation."""
         return max(rows, key=lambda row: abs(self.values[row]) / self.deviations[row])
 
 
@@ -442,7 +443,11 @@ def _undetermined(shown: str, *, has_depth: bool) -> CalibrationCheck:
 
 
 def _unconnected(store: KeyframeStore, reading: DepthReading) -> str:
-    """Return what a drive has too little of for its keyframes to connect, as a phrase for a message."""
+    """Return why too few keyframes of a drive connect, as the object of the sentence "the drive has ...".
+
+    Reasons are too few features with a depth, too few poses of a camera without depth, or, if neither is the
+    case, too few views with common features.
+    """
     keyframes = store.keyframes
     if store.has_depth or store.has_stereo:
         read = np.concatenate([each.depths_m[reading.flip] for each in keyframes])

@@ -94,7 +94,7 @@ def best_reading(keyframes: list[Keyframe], tracks: Tracks) -> DepthReading:
 
 
 def nearest_delay(keyframes: list[Keyframe], delay_s: float) -> float:
-    """Round a delay to a multiple of the interval of the depth images, seconds.
+    """Round a delay (see `DepthReading`) to a multiple of the interval of the depth images, both in seconds.
 
     The result is bounded by the times before and after keyframes for which depth images were kept; it is 0
     without such images.

@@ -40,7 +40,7 @@ _NAMESPACES = ("http://www.w3.org/",)
 
 
 class _Page(HTMLParser):
-    """The addresses that one page loads."""
+    """Collects in ``loads`` the addresses that a browser requests in order to show one HTML page."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -79,7 +79,11 @@ def outside_requests(files: Mapping[str, str]) -> Iterator[str]:
 
 
 def main(words: list[str]) -> int:
-    """Print the requests to other hosts; return 1 if there are any, or no page."""
+    """Print each request to another host of the site in the folder ``words[0]``, and their number.
+
+    Returns:
+        The exit code: 1 if there is such a request, or the folder has no HTML page; else 0.
+    """
     root = Path(words[0])
     files = {
         file.relative_to(root).as_posix(): file.read_text(encoding="utf-8")

@@ -31,7 +31,7 @@ SDK = {
     "Recordings": ("Dataset", "open_dataset"),
     "Large data": ("DataClient", "DataOptions"),
 }  # fmt: skip
-"""Section -> names of `client_sdk`; names that stand nowhere get a section of their own."""
+"""Section -> names of `client_sdk`; public names that stand in no section are put into a section "More"."""
 _MODULES = ("client_sdk.cameras", "rse_pf.geometry", "rse_pf.pnp", "rse_pf.auth.robot_key", "rse_pf.service")
 """Further modules whose public names a robot's program or a service uses."""
 _METRIC_SOURCES = ("rse_pf/server/metrics.py", "rse_pf/local/control/federation.py")
@@ -42,7 +42,7 @@ _FAMILIES = {
 }
 _LINK = re.compile(r"(\]\()([^)\s]+)(\))")
 _LISTED = {".py": "python", ".md": "markdown", ".json": "json", ".lua": "lua", ".cpp": "cpp", ".sh": "sh"}
-"""Ending -> language of the files that are listed on the site."""
+"""Ending -> language of the files that have a listing: a page of the site with the text of the file."""
 _WIDTH = "96"
 
 
@@ -76,7 +76,10 @@ def moved(text: str) -> str:
 
 
 def sources(root: Path) -> dict[str, str]:
-    """Return a page for each file outside of ``docs`` to which a page links, by its address on the site."""
+    """Return the listings of all files outside of ``docs`` to which a page links, by address on the site.
+
+    A listing is a page with the text of a file; only files with an ending of `_LISTED` have one.
+    """
     found = {}
     for page in sorted((root / "docs").rglob("*.md")):
         for _, link, _ in _LINK.findall(page.read_text(encoding="utf-8")):
@@ -90,9 +93,10 @@ def sources(root: Path) -> dict[str, str]:
 
 
 def inside(root: Path, page: str, text: str) -> str:
-    """Return a page of ``docs`` whose links to other files of the checkout lead to their listings.
+    """Return *text*, a page of ``docs``, whose links to files outside of ``docs`` lead to their listings.
 
-    Folders and files that have no listing are named instead of linked.
+    The listing of a file is the page of the site with its text, see `sources`.  A link to a folder, or to a
+    file without a listing, is replaced by its own text as code.  Other links are unchanged.
     """
 
     def link(found: re.Match[str]) -> str:
@@ -109,7 +113,10 @@ def inside(root: Path, page: str, text: str) -> str:
 
 
 def _outside(root: Path, page: str, link: str) -> str:
-    """Return the path from the checkout of what a link leads to, or nothing if that is a part of the site."""
+    """Return the file or folder outside of ``docs`` to which a link leads, relative to *root*.
+
+    Empty if the link leads to a page of ``docs``, to another host, or to no existing file.
+    """
     target = link.partition("#")[0]
     if not target or "://" in target:
         return ""
@@ -143,7 +150,10 @@ def sdk_page() -> str:
 
 
 def _directive(path: str) -> str:
-    """Return what makes mkdocstrings describe *path*, and the fields that its docstring does not list."""
+    """Return the directive by which mkdocstrings documents the public name *path*.
+
+    Fields are documented as well if the docstring does not list them.
+    """
     lines = [f"::: {path}", "    options:", "      heading_level: 3"]
     module, _, name = path.rpartition(".")
     described = getattr(importlib.import_module(module), name)
@@ -154,7 +164,7 @@ def _directive(path: str) -> str:
 
 
 def _public_names(module: str) -> list[str]:
-    """Return ``__all__`` as the source says it; constants without a docstring are left out."""
+    """Return ``__all__`` of a module, in the order of its source; empty if it has none."""
     root = Path(__file__).resolve().parents[2]
     base = root.joinpath(*module.split("."))
     file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")

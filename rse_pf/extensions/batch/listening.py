@@ -13,9 +13,10 @@ from rse_pf.http.unauthenticated import SilentConnections
 
 __all__ = ["bound_handshakes", "without_pages"]
 
-# Largest number of connections whose handshakes are not finished, of all addresses.
+# Largest number of connections of a listener whose handshakes are not finished; above it, the oldest
+# is closed.
 _MAX_SILENT = 128
-# Largest number of connections whose handshakes are not finished, of one address.
+# Largest number of such connections from one address; above it, the oldest one from this address is closed.
 _MAX_PER_SOURCE = 64
 
 
@@ -25,9 +26,12 @@ def without_pages(kind: Any) -> Any:
 
 
 def bound_handshakes() -> None:
-    """Let all TLS listeners that Dask opens from now on close connections with unfinished handshakes.
+    """Limit connections with unfinished handshakes at all TLS listeners that Dask opens from now on.
 
-    Dask's registry of listeners is changed for the whole process.
+    A listener closes a connection whose handshakes (TLS, then Dask's) are not finished after 6 s
+    (`FIRST_REQUEST_S`), and the oldest one if more than 128 are unfinished, or more than 64 of one address.
+    Dask's registry of listeners is changed for the whole process; listeners that are open already have no
+    limits.
     """
     from distributed.comm.registry import backends
     from distributed.comm.tcp import TLSListener

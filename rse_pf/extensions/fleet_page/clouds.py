@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["BLOCK_POINTS", "MAX_POINTS", "MapPages", "packer", "spread_order"]
 
 MAX_POINTS = 1_000_000
-"""Largest number of points of a cloud that are sent; of a larger cloud, a sample is sent."""
+"""Largest number of points of a cloud that are sent; of a larger cloud, an even sample is sent, see
+`spread_order`."""
 BLOCK_POINTS = 50_000
 """Number of points in a block.
 
@@ -50,7 +51,7 @@ class MapPages:
     """The stored maps of one platform as documents for the page: their list, and packed clouds."""
 
     def __init__(self, folder: Path) -> None:
-        """Describe the platform whose state is in *folder*; nothing is read."""
+        """Prepare to read the maps of the platform whose state is in *folder*; nothing is read yet."""
         self._folder = folder
         self._processes = LimitedProcesses(
             "rse_pf.extensions.fleet_page.clouds:packer",
@@ -61,9 +62,11 @@ class MapPages:
         self._preparing: asyncio.Task[None] | None = None
 
     async def maps(self) -> tuple[str, bytes]:
-        """Return media type and JSON with all maps and their versions, newest first.
+        """Return media type and JSON with the maps of all tenants, each with its versions, the newest first.
 
-        Packing of the newest cloud of the first map, which the page shows first, is started as well.
+        At most 200 maps of a tenant and the newest 200 versions of a map are listed; damaged maps are left
+        out.  A task is started that packs the cloud of the head of the first map, which the page shows first,
+        see `packer`.
         """
         listed = await asyncio.to_thread(self._maps)
         if listed and (self._preparing is None or self._preparing.done()):
@@ -71,7 +74,7 @@ class MapPages:
         return "application/json", json.dumps(listed).encode()
 
     async def cloud(self, query: Mapping[str, str]) -> tuple[str, bytes]:
-        """Return media type and packed cloud of the map ``map`` of *query*, of ``version`` or the newest one.
+        """Return media type and packed cloud of the map ``map`` of *query*, of ``version`` or else its head.
 
         Raises:
             NotFound: There is no such map or version.

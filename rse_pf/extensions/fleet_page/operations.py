@@ -35,7 +35,7 @@ class LocalOperations:
     """Executes operations of the platform whose state is in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Describe the platform whose state is in *folder*; nothing is requested."""
+        """Prepare operations of the platform whose state is in *folder*; nothing is requested yet."""
         self._folder = folder
 
     async def operate(self, action: str, parameters: Mapping[str, str]) -> Mapping[str, Any]:

@@ -33,7 +33,7 @@ class Replays:
     """Replays commands of one platform for the page, one at a time."""
 
     def __init__(self, folder: Path, *, wall_clock: Callable[[], float] = time.time) -> None:
-        """Describe the platform whose state is in *folder*; no process is started."""
+        """Prepare replays of the platform whose state is in *folder*; no process is started yet."""
         self._folder = folder
         self._wall_clock = wall_clock
         self._replay: LimitedReplay | None = None

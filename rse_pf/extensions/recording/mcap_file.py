@@ -28,7 +28,7 @@ _MESSAGE_BYTES = _MESSAGE.size
 _MESSAGE_FIELDS = _MESSAGE_BYTES - 9  # bytes of its fields without opcode (1) and length (8)
 _pack_message = _MESSAGE.pack
 # A chunk record: opcode, length, first and last time (ns), uncompressed size, CRC, length of the name of the
-# compression, size of the records that follow.
+# compression, size of the records that follow.  Chunks are not compressed: the name is empty, its length 0.
 _CHUNK = struct.Struct("<BQQQQIIQ")
 _CHUNK_FIELDS = _CHUNK.size - 9  # bytes of its fields without opcode (1) and length (8)
 # A message index record: opcode, length, channel, size of the pairs of time and offset that follow.
@@ -36,8 +36,8 @@ _INDEX = struct.Struct("<BQHI")
 # Start of a chunk index record: opcode, length, first and last time (ns), offset and size of the chunk, size
 # of the message index offsets that follow.
 _CHUNK_INDEX = struct.Struct("<BQQQQQI")
-# End of a chunk index record: size of the message indexes, length of the name of the compression, compressed
-# and uncompressed size.
+# End of a chunk index record, after its message index offsets: size of the message indexes, length of the
+# name of the compression (0, so that no name follows), compressed and uncompressed size (the same).
 _CHUNK_INDEX_END = struct.Struct("<QIQQ")
 _OFFSET = struct.Struct("<HQ")  # one message index offset: channel, offset of the index in the file
 _OP_MESSAGE, _OP_CHUNK, _OP_INDEX, _OP_CHUNK_INDEX = 5, 6, 7, 8  # opcodes of the MCAP specification

@@ -34,15 +34,15 @@ UP = 2  # a message was received from a robot
 DOWN = 3  # a message was sent to a robot
 CLOSED = 4  # a connection was closed
 LOST = 5  # messages were dropped; the data are their total number
-DECODED_COMMAND = 6  # as UP, for a command: its id and texts precede the message
+DECODED_COMMAND = 6  # as UP, for a command: its id and free texts precede the message
 ANSWER_WITH_POSE = 7  # as DOWN, for a result with a pose: command id and pose precede the message
 _ENTRY = struct.Struct("<BIQI")
 """Head of an entry: its kind, the number of the connection, the Unix time in ns, and the number of bytes of
 data that follow."""
 _DECODED_HEAD = struct.Struct("<QB")
-"""Head of the data of a ``DECODED_COMMAND``: the id of the command, and the number of bytes of its texts.
-The texts and the message follow."""
-_MAX_TEXTS_BYTES = 255  # largest size of the texts of a command, which `_DECODED_HEAD` stores in one byte
+"""Head of the data of a ``DECODED_COMMAND``: the id of the command, and the number of bytes of its free
+texts, ``stream`` and ``trace``.  The texts and the message follow."""
+_MAX_TEXTS_BYTES = 255  # largest size of the free texts of a command: `_DECODED_HEAD` has one byte for it
 _POSE_HEAD = struct.Struct("<Q16d")
 """Head of the data of an ``ANSWER_WITH_POSE``: the id of the command, and ``T_camera_world``, row-major.  The
 message follows."""
@@ -170,10 +170,13 @@ class RecordingTap:
             self.dropped += 1
 
     def observe_command(self, data: bytes, command: Command) -> None:
-        """Record id and texts of the *command* that *data*, the message that was received last, holds.
+        """Put id and free texts of *command* before its message *data* in the entry that was recorded last.
 
-        This spares the recorder to inflate the message.  It is done only if the codec has decoded the payload
-        to a structure, whose fields are all known: then ``stream`` and ``trace`` are the only free texts.
+        The recorder searches messages for tokens and names of robots.  With the free texts it can do so
+        without inflating the message.  The entry stays as it is, and the recorder inflates the message, if
+        the codec has not decoded the payload to a structure with known fields (then texts other than
+        ``stream`` and ``trace`` may be free), or if both texts together exceed 255 bytes.  Nothing is done if
+        *data* was dropped.
         """
         if isinstance(command.payload, msgspec.Struct):
             text = f"{command.stream} {command.trace}".encode()
@@ -188,11 +191,11 @@ class RecordingTap:
             self.dropped += 1
 
     def observe_answer(self, data: bytes, command: Command, answer: Result | Failure) -> None:
-        """Record the pose of the *answer* that *data*, the message that was sent last, holds.
+        """Put the pose of *answer* before its message *data* in the entry that was recorded last.
 
-        This spares the recorder to inflate the message.  The pose is not recorded if the answer has none, or
-        if the payload of the command was not decoded to a structure: the answer may then hold texts of the
-        robot.
+        The recorder then does not have to inflate the message.  The entry stays as it is, and the recorder
+        inflates the message, if the answer has no pose, or if the payload of the command was not decoded to a
+        structure (the answer may then contain texts of the robot).  Nothing is done if *data* was dropped.
         """
         if not isinstance(command.payload, msgspec.Struct) or not isinstance(answer, Result):
             return
@@ -302,7 +305,7 @@ class PipeEntry(NamedTuple):
 
 
 def split_decoded_command(data: bytes) -> tuple[int, bytes, bytes]:
-    """Return the id of the command, its texts, and the message in the data of a ``DECODED_COMMAND``."""
+    """Return the id of the command, its free texts, and the message in the data of a ``DECODED_COMMAND``."""
     identity, size = _DECODED_HEAD.unpack_from(data)
     end = _DECODED_HEAD.size + size
     return identity, data[_DECODED_HEAD.size : end], data[end:]

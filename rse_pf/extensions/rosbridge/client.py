@@ -349,5 +349,7 @@ def _argument(call: Operation, name: str) -> str:
     try:
         value = msgspec.json.decode(call.args, type=dict[str, str]).get(name, "")
     except msgspec.DecodeError as error:
-        raise BadRequest(f"rosapi: {str(error)[:150]}", hint=f"send {name}") from error
+        raise BadRequest(
+            f"rosapi: {str(error)[:150]}", hint=f'send the arguments {{"{name}": "NAME"}}'
+        ) from error
     return value.removeprefix("/")

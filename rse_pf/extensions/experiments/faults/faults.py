@@ -153,7 +153,7 @@ def cut_off(server: ServerState, platform: str) -> Iterator[None]:
         assert child.stdin is not None
         child.stdin.write(commands)
         child.stdin.flush()
-        _wait_until_it_holds(child)
+        _wait_for_rules(child)
         yield
     finally:
         child.kill()
@@ -177,8 +177,10 @@ def nft_commands(table: str, ports: Sequence[int]) -> str:
     )
 
 
-def _wait_until_it_holds(child: subprocess.Popen[str]) -> None:
-    """Read the output of *child*, nft, until its last command has listed both rules.
+def _wait_for_rules(child: subprocess.Popen[str]) -> None:
+    """Wait until the two rules of `nft_commands`, to and from the ports of the server, drop packets.
+
+    The output of *child*, nft, is read until its last command has listed both rules; there is no time limit.
 
     Raises:
         ConfigurationError: nft reports an error, or exits.

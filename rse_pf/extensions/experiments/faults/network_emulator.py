@@ -196,6 +196,7 @@ class EmulatedLink:
     def cut(self, cause: str = "asked") -> None:
         """Deliver nothing in either direction from now on, without closing a connection.
 
+        Bytes that are sent during the cut are kept and delivered after it; new connections are not accepted.
         The cut lasts until `heal` was called for each *cause* of it.
         """
         self._cutting.add(cause)
@@ -205,9 +206,10 @@ class EmulatedLink:
             self._stop_answering()
 
     def heal(self, cause: str = "asked") -> None:
-        """End the cut of *cause*.
+        """End the cut of *cause*; do nothing if there is none.
 
-        Deliver again, also the bytes sent meanwhile, unless another cause remains.
+        Unless another cause remains, new connections are accepted, and the bytes sent meanwhile are delivered
+        when TCP would have retransmitted them, see `retransmitted_s`.
         """
         self._cutting.discard(cause)
         if self._cutting or not self.is_cut:
@@ -493,6 +495,11 @@ class LinkProcess:
 
 
 def _exchange(pipe: Connection, word: str | None) -> Any:
+    """Send "cut" or "heal", nothing if *word* is None, and return the next answer of the link's process.
+
+    Raises:
+        ConfigurationError: No answer arrives within 20 s, or the process has exited.
+    """
     try:
         if word is not None:
             pipe.send(word)
@@ -506,7 +513,15 @@ def _exchange(pipe: Connection, word: str | None) -> Any:
 
 
 def _run(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None:
-    """Run an `EmulatedLink` until the parent closes *pipe* or exits; entry point of the process."""
+    """Run an `EmulatedLink` until the parent closes *pipe* or exits; entry point of the process.
+
+    Its port is sent to *pipe* at first.  Then each "cut" or "heal" that the parent sends is performed, and
+    sent back as a confirmation.
+
+    Args:
+        arguments: The profile, host and port of the server, and the seed of the link.
+        pipe: The process's end of the pipe to the parent.
+    """
     try:
         asyncio.run(_serve(arguments, pipe))
     except KeyboardInterrupt:

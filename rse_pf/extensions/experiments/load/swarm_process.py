@@ -40,7 +40,7 @@ __all__ = [
     "run_swarm_process",
 ]  # fmt: skip
 
-# The parts of a round trip (up, queue, compute, down) of a command that has none, because it has no result.
+# Up, queue, compute and down time (ms) in the row of a command without a result: they are not known.
 _NO_PARTS = (math.nan,) * 4
 # Rows of commands that are sent to the parent in one message at most.
 _ROWS = 256

@@ -29,7 +29,7 @@ class AuditRows:
     """Reads the audit logs of one platform: at first their last lines, then what is appended."""
 
     def __init__(self, folder: Path) -> None:
-        """Describe the platform whose state is in *folder*; nothing is read."""
+        """Prepare to read the audit logs of the platform whose state is in *folder*; nothing is read yet."""
         self._folder = audit_folder(folder)
         self._tail = FileTail()
         self.skipped = 0
@@ -49,11 +49,14 @@ class AuditRows:
     def new_rows(
         self, is_reported: Callable[[Entry], bool] = lambda entry: False
     ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Return the rows of the Events view for new entries, and the control plane's events among them.
+        """Return the new entries in two lists: rows of the Events view, and events of the control plane.
+
+        Each new entry is in one of the lists: in the second one if its action begins with `PLATFORM`, else in
+        the first one.  The caller makes rows of the events, as of those in the control plane's own stream.
 
         Args:
-            is_reported: Returns whether an event of the control plane was reported in another way; such an
-                event is left out.
+            is_reported: Returns whether the stream of the control plane has reported an event already; such
+                an event is in neither list.
         """
         rows: list[dict[str, Any]] = []
         events: list[dict[str, Any]] = []

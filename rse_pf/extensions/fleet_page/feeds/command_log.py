@@ -31,7 +31,7 @@ class CommandLog:
     """Reads the logs of the servers in a folder: at first their last lines, then what is appended."""
 
     def __init__(self, folder: Path) -> None:
-        """Describe the folder of the logs; nothing is read."""
+        """Prepare to read the logs in *folder*; nothing is read yet."""
         self._folder = folder
         self._tail = FileTail()
         self.skipped = 0

@@ -48,7 +48,7 @@ class LiveFeed:
     """Puts the live maps that open pages show into a `Hub`."""
 
     def __init__(self, hub: Hub, folder: Path) -> None:
-        """Describe the platform whose state is in *folder*; nothing is connected."""
+        """Prepare the feed to *hub* of the platform whose state is in *folder*; `run` connects to it."""
         self._hub = hub
         self._folder = folder
         self._followed: dict[str, asyncio.Task[None]] = {}

@@ -58,7 +58,7 @@ _HISTORY = 600
 _MAX_TEXT = 300
 # Largest number of events about moved robots after one reading.
 _MAX_MOVE_EVENTS = 50
-# Largest number of robots that are on no server whose last server is stored.
+# Largest number of robots without a connection to a server for which the last server is still stored.
 _MAX_GONE = 500
 # Exceptions of an unexpected answer, such as that of a server of another version or of one that is being
 # killed.
@@ -69,7 +69,7 @@ class LocalFeed:
     """Puts state, robots, commands and events of one local platform into a `Hub`."""
 
     def __init__(self, hub: Hub, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        """Describe the platform whose state is in *folder*; *clock* returns seconds, monotonic."""
+        """Prepare the feed of the platform whose state is in *folder*; *clock* returns seconds, monotonic."""
         self._hub = hub
         self._folder = folder
         self._clock = clock
