@@ -8,15 +8,15 @@ export interface RobotOptions {
   token?: string | (() => string | Promise<string>);
   /** How the token travels: as a sub-protocol (default), or as a header, which only Node can set. */
   tokenIn?: "protocol" | "header";
-  /** `json+zlib` (default) or `json`. */
-  codec?: "json+zlib" | "json";
+  /** Format of messages: `zlib` (JSON compressed by zlib, the default) or `json`. */
+  codec?: "zlib" | "json";
   /** Name and version of the program, for the server's log. */
   sdk?: string;
   /**
-   * Called with what happened to the connection, and the server's name or the reason. `refused` says why its servers
-   * do not take the robot, which goes on trying; `ended` that it was closed, or that its first connect failed.
+   * Called with `link-lost` or `refused` and the reason, or with `link-back` or `moved` and the name of the server.
+   * A robot that its servers refuse goes on reconnecting. The first connect and `close` are not reported.
    */
-  onChange?: (what: "link-lost" | "link-back" | "moved" | "refused" | "ended", why: string) => void;
+  onChange?: (what: "link-lost" | "link-back" | "moved" | "refused", why: string) => void;
   /** Time until the Welcome; default 4000. */
   connectTimeoutMs?: number;
   /** A connection with an unanswered command on which nothing arrives for so long is lost; default 1000. */
@@ -97,19 +97,25 @@ export interface PnpReply {
 
 export interface Stats {
   sent: number;
+  /** Commands that ended with an answer. */
   answered: number;
+  /** Commands that ended with an error. */
+  failed: number;
+  /** How often a command was sent again, after a lost connection or a failure of its server. */
   resent: number;
   reconnects: number;
   moves: number;
-  bytesUp: number;
-  bytesDown: number;
+  /** Bytes of all WebSocket messages that were sent. */
+  bytesOut: number;
+  /** Bytes of all WebSocket messages that were received. */
+  bytesIn: number;
   unanswered: number;
-  roundTripMs: number | null;
-  /** Commands that were not sent at once although there was a connection: after busy, */
-  heldByBusy: number;
-  /** and by what the Welcome allows. */
-  heldByLimit: number;
-  /** Functions of the program that threw, or whose promise was rejected: callbacks and the token function. */
+  /**
+   * Commands that were not sent at once although there was a connection: by `busy` (the server's answer to this
+   * command or another one of its stream) or `own-limit` (limits of the Welcome).
+   */
+  heldBack: { busy: number; "own-limit": number };
+  /** Calls of the program's functions (callbacks and the token function) that threw or were rejected. */
   callbackErrors: number;
 }
 
@@ -118,10 +124,10 @@ export interface Robot {
   readonly server: string;
   /** Name of the robot, from its token. */
   readonly robot: string;
-  /** The error with which the robot ended, or null while it lives. */
+  /** The error with which every call fails after `close`; null before. */
   readonly error: RsePfError | null;
-  /** Why its servers refuse the robot now; its calls end so at once, and it goes on trying. Null while they do not. */
-  readonly refusal: RsePfError | null;
+  /** Why all servers refuse this robot now: every call rejects with this error. Null while they do not. */
+  readonly failure: RsePfError | null;
   readonly stats: Stats;
   /** Call a service; rejects with an RsePfError. */
   call<Reply = any>(service: string, payload?: unknown, options?: CallOptions): Promise<Answer<Reply>>;
@@ -158,7 +164,7 @@ export class RsePfError extends Error {
 
 /** How messages are written and read, by the name of the codec. */
 export const codecs: Record<
-  "json" | "json+zlib",
+  "json" | "zlib",
   {
     encode(text: string): string | Promise<Uint8Array>;
     decode(data: any): unknown;

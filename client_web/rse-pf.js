@@ -103,7 +103,7 @@ const inOrder = (before, work, then) =>
 /** Name -> how the text of a message becomes the content of a WebSocket message, and how that is read. */
 export const codecs = {
   json: { encode: (text) => text, decode: parse },
-  "json+zlib": {
+  zlib: {
     encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
     decode: async (data) =>
       parse(
@@ -181,7 +181,7 @@ const lasts = (failed) => failed._validInS > SOON_S;
 export const connect = async (url, options = {}) => {
   const httpUrl = url.replace(/^ws/, "http");
   const {
-    codec = "json+zlib", tokenIn = "protocol", sdk = "rse-pf-js/0.3.0", onChange = nothing, connectTimeoutMs = 4000,
+    codec = "zlib", tokenIn = "protocol", sdk = "rse-pf-js/0.3.0", onChange = nothing, connectTimeoutMs = 4000,
     stallTimeoutMs = 1000, dataUrl = httpUrl, WebSocket = globalThis.WebSocket,
   } = options;
   const { encode, decode } = codecs[codec] || {};
@@ -194,7 +194,7 @@ export const connect = async (url, options = {}) => {
   const printed = new Set();
   const lanes = { __proto__: null };
   const counts = {
-    sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0, heldByBusy: 0, heldByLimit: 0,
+    sent: 0, answered: 0, failed: 0, resent: 0, reconnects: 0, moves: 0, bytesOut: 0, bytesIn: 0, heldBack: { busy: 0, "own-limit": 0 },
     callbackErrors: 0,
   };
   let { token } = options;
@@ -214,7 +214,6 @@ export const connect = async (url, options = {}) => {
   let retries = MAX_RETRIES;
   let renewal = nothing;
   let error = null;
-  let roundTripMs = null;
 
   /** Call a function of the program; what it throws, at once or as a promise, is reported, and rejects. */
   const guarded = async (call, ...words) => {
@@ -256,7 +255,7 @@ export const connect = async (url, options = {}) => {
   const dial = async () => {
     const used = await freshToken();
     if (error) throw error;
-    const protocol = "rse-pf.v1." + codec;
+    const protocol = "rse-pf.v1." + codec.replace("zlib", "json+zlib");
     const time = now();
     const link = {
       _token: used, _left: Infinity, _filledAt: time, _heardAt: time, _checkedAt: time,
@@ -456,7 +455,6 @@ export const connect = async (url, options = {}) => {
     settleAll(pending, failed);
     subscriptions.forEach((each) => later(each._onEnd, failed));
     links.forEach((link) => lose(link, failed));
-    later(onChange, "ended", failed.message);
   };
 
   // --- messages ------------------------------------------------------------------------------------------
@@ -471,7 +469,7 @@ export const connect = async (url, options = {}) => {
       if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
         settle(command, wrong("too-large", `${size} bytes are too many`, "upload it, name its digest"));
       } else if (links.has(link)) {
-        counts.bytesUp += size;
+        counts.bytesOut += size;
         link._socket.send(data);
       }
     };
@@ -481,7 +479,7 @@ export const connect = async (url, options = {}) => {
 
   const hear = (link, data) => {
     link._heardAt = now();
-    counts.bytesDown += sizeOf(data);
+    counts.bytesIn += sizeOf(data);
     link._incoming = inOrder(link._incoming, () => decode(data), (message) => receive(link, message)).catch((problem) => {
       const failed = unreadable("cannot read it: " + problem);
       const isDamaged = problem?.name; // otherwise it is a type that is not known here
@@ -509,7 +507,6 @@ export const connect = async (url, options = {}) => {
       },
       pong() {
         link._unansweredAt = null;
-        roundTripMs = (time - message.sent_s - (message.answered_s - message.received_s)) * 1e3;
       },
       move() {
         if (!isHere) return;
@@ -615,7 +612,7 @@ export const connect = async (url, options = {}) => {
     pending.delete(each._id);
     if (each._isSettled) return;
     each._isSettled = true;
-    counts.answered++;
+    counts[failed ? "failed" : "answered"]++;
     each._signal?.removeEventListener("abort", each._cancel);
     each._end(failed, result);
   };
@@ -659,8 +656,8 @@ export const connect = async (url, options = {}) => {
         if (isBusy && busyUntil >= each._until) {
           return settle(each, told({ ...busy, trace: each._trace, retry_after_ms: heldS * 1e3 }));
         }
-        const why = isBusy ? "Busy" : room-- > 0 ? 0 : "Limit";
-        if (why) return (each._isHeld ||= ++counts["heldBy" + why]);
+        const why = isBusy ? "busy" : room-- > 0 ? 0 : "own-limit";
+        if (why) return (each._isHeld ||= ++counts.heldBack[why]);
         if (each._at) counts.resent++;
         each._link = current;
         each._at = time;
@@ -757,11 +754,11 @@ export const connect = async (url, options = {}) => {
     get error() {
       return error;
     },
-    get refusal() {
+    get failure() {
       return refusal;
     },
     get stats() {
-      return { ...counts, unanswered: pending.size, roundTripMs };
+      return { ...counts, heldBack: { ...counts.heldBack }, unanswered: pending.size };
     },
 
     call: (service, payload = null, options = {}) =>

@@ -9,7 +9,7 @@
 #include <thread>
 #include <vector>
 
-#include <rse_pf/client.hpp>
+#include <rse_pf/robot.hpp>
 
 int main(int argc, char** argv) {
     if (argc != 6) return 2;
@@ -22,11 +22,11 @@ int main(int argc, char** argv) {
     const auto at = [&](double seconds) {
         std::this_thread::sleep_until(began + std::chrono::microseconds(static_cast<long long>(1e6 * seconds)));
     };
-    std::vector<std::unique_ptr<rse_pf::Client>> clients;
+    std::vector<std::unique_ptr<rse_pf::Robot>> clients;
     for (int k = 0; k < robots; ++k) {
         rse_pf::Options options;
         options.url = argv[1];
-        clients.push_back(std::make_unique<rse_pf::Client>(std::move(options)));
+        clients.push_back(std::make_unique<rse_pf::Robot>(std::move(options)));
         clients.back()->connect();
     }
     rse_pf::CallOptions options;

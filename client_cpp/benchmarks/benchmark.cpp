@@ -12,7 +12,7 @@
 #include <sys/resource.h>
 #include <thread>
 
-#include <rse_pf/client.hpp>
+#include <rse_pf/robot.hpp>
 
 namespace {
 
@@ -67,8 +67,8 @@ int main(int argc, char** argv) {
         rse_pf::Options options;
         options.url = argv[1];
         options.token = argv[2];
-        rse_pf::Client client(options);
-        client.connect();
+        rse_pf::Robot robot(options);
+        robot.connect();
         const rse_pf::json value = {{"value", rse_pf::array(std::vector<double>(400, 0.5))}};
         const auto rest = std::chrono::duration<double>(pace > 0 ? 1 / pace : 0);
         std::vector<double> pose_ms, echo_ms, pose_net_ms;
@@ -77,13 +77,13 @@ int main(int argc, char** argv) {
         getrusage(RUSAGE_SELF, &before);
         for (int i = 0; i < poses; ++i) {  // in turn, so that both see the same machine
             double begin = cpu_s();
-            const auto pose = client.pnp(request, {}).get();
+            const auto pose = robot.solve_pnp(request, {}).get();
             pose_cpu += cpu_s() - begin;
             pose_ms.push_back(pose.round_trip_ms);
             pose_net_ms.push_back(pose.round_trip_ms - pose.compute_ms);
             std::this_thread::sleep_for(rest);
             begin = cpu_s();
-            const auto echo = client.call("echo", value).get();
+            const auto echo = robot.call("echo", value).get();
             echo_cpu += cpu_s() - begin;
             echo_ms.push_back(echo.round_trip_ms - echo.compute_ms);
             std::this_thread::sleep_for(rest);
@@ -94,7 +94,7 @@ int main(int argc, char** argv) {
         getrusage(RUSAGE_SELF, &after);
         const auto us = [](const timeval& a, const timeval& b) { return static_cast<double>(b.tv_sec - a.tv_sec) * 1e6 + static_cast<double>(b.tv_usec - a.tv_usec); };
         out["cpu_us_a_command"] = {{"user", us(before.ru_utime, after.ru_utime) / 2 / poses}, {"system", us(before.ru_stime, after.ru_stime) / 2 / poses}};
-        const auto answer = client.call("pnp", rse_pf::json::from_msgpack(rse_pf::encoded(request))).get();
+        const auto answer = robot.call("pnp", rse_pf::json::from_msgpack(rse_pf::encoded(request))).get();
         const auto tree = rse_pf::json::from_msgpack(rse_pf::encoded(request));
         out["encode_us"] = {{"own", each_us(2000, [&] { rse_pf::encoded(request); })}, {"tree", each_us(2000, [&] { rse_pf::encoded(tree); })}};
         out["decode_us"] = {{"own", each_us(2000, [&] { rse_pf::pose_of(answer); })}, {"tree", each_us(2000, [&] { answer.reply(); })}};
@@ -111,7 +111,7 @@ int main(int argc, char** argv) {
                 changed.wait(lock, [&] { return open < 8; });
                 ++open;
                 lock.unlock();
-                client.pnp(request, rse_pf::Client::in_stream("front"), [&](rse_pf::Outcome<rse_pf::Pose>) {
+                robot.solve_pnp(request, rse_pf::Robot::in_stream("front"), [&](rse_pf::Outcome<rse_pf::PoseAnswer>) {
                     const std::lock_guard inside(mutex);
                     --open;
                     changed.notify_one();
@@ -132,7 +132,7 @@ int main(int argc, char** argv) {
                              {"cpu_us_a_pose", (cpu_s() - cpu_before) / static_cast<double>(sent) * 1e6}};
         }
         std::printf("%s\n", out.dump(1).c_str());
-    } catch (const rse_pf::Error& error) {
+    } catch (const rse_pf::RsePfError& error) {
         return std::fprintf(stderr, "%s\n", error.what()), 1;
     }
 }

@@ -15,7 +15,7 @@
 #include <opencv2/features2d.hpp>
 #include <opencv2/imgcodecs.hpp>
 
-#include <rse_pf/client.hpp>
+#include <rse_pf/robot.hpp>
 
 namespace {
 
@@ -105,8 +105,8 @@ int main(int argc, char** argv) {
     const auto images = entries(folder + "/rgb.txt"), depths = entries(folder + "/depth.txt");
     if (images.empty() || depths.empty()) return std::fprintf(stderr, "%s holds no rgb.txt and depth.txt\n", argv[1]), 1;
     try {
-        rse_pf::Client client(options);
-        client.connect();
+        rse_pf::Robot robot(options);
+        robot.connect();
         std::ofstream trajectory(argv[4]);
         const auto orb = cv::ORB::create(1000);
         Keyframe keyframe;
@@ -128,10 +128,10 @@ int main(int argc, char** argv) {
             }
             const auto request = request_of(keyframe, points, descriptors);
             try {
-                if (request.pixels.size() < 12) throw rse_pf::Error("too-few", "too few matches");
-                const rse_pf::Pose pose = client.pnp(request).get();
+                if (request.pixels.size() < 12) throw rse_pf::RsePfError("too-few", "too few matches");
+                const rse_pf::PoseAnswer pose = robot.solve_pnp(request).get();
                 worst_ms = std::max(worst_ms, pose.round_trip_ms);
-                if (!pose.ok()) throw rse_pf::Error("weak", pose.reason);
+                if (!pose.ok()) throw rse_pf::RsePfError("weak", pose.reason);
                 const Transform T_world_camera = keyframe.T_world_camera * Transform(pose.T_camera_world.data()).inv();
                 write_pose(trajectory, images[i].time_s, T_world_camera);
                 ++answered;
@@ -142,14 +142,14 @@ int main(int argc, char** argv) {
                     keyframe = keyframe_of(folder, depth->file, points, descriptors);
                     keyframe.T_world_camera = T_world_camera;
                 }
-            } catch (const rse_pf::Error& error) {  // this image has no pose; the next one may have
+            } catch (const rse_pf::RsePfError& error) {  // this image has no pose; the next one may have
                 ++weak;
                 std::fprintf(stderr, "image %zu: %s\n", i, error.what());
             }
             std::this_thread::sleep_until(next);
         }
         std::printf("%zu of %zu images have a pose, %zu have none; longest round trip %.1f ms\n", answered + 1, images.size(), weak, worst_ms);
-    } catch (const rse_pf::Error& error) {
+    } catch (const rse_pf::RsePfError& error) {
         return std::fprintf(stderr, "%s\n", error.what()), 1;
     }
 }

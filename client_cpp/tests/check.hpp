@@ -19,7 +19,7 @@ template <class Work> void expect_error(const std::string& code, Work work, cons
     try {
         work();
         expect(false, what + ": no error");
-    } catch (const rse_pf::Error& error) {
+    } catch (const rse_pf::RsePfError& error) {
         expect(error.code() == code, what + ": " + error.what());
     }
 }

@@ -58,20 +58,20 @@ Options to(const std::string& url) {
 
 void addresses_are_checked_before_anything_is_opened() {
     for (const char* url : {"", "robot", "ftp://a/ws", "ws://", "ws://a:b/ws", "ws://u@a/ws", "ws://a/ws?token=x", "ws://a:1 /ws"}) {
-        expect_error("usage", [&] { Client client(to(url)); }, url);
+        expect_error("usage", [&] { Robot robot(to(url)); }, url);
     }
     const auto address = detail::address_of("wss://[::1]:8443/ws");
     expect(address.secure && address.host == "::1" && address.port == "8443" && address.authority() == "[::1]:8443", "an address of IPv6");
     Options options = to("wss://localhost/ws");
     options.ca_file = "missing.pem";
-    expect_error("usage", [&] { Client client(options); }, "a file that is missing");
+    expect_error("usage", [&] { Robot robot(options); }, "a file that is missing");
 }
 
 void nobody_listens() {
-    Client client(to("ws://127.0.0.1:1/ws"));
-    expect_error("connect", [&] { client.connect(); }, "no server");
-    expect_error("disconnected", [&] { client.call("echo", {}).get(); }, "a call without a connection");
-    expect_error("usage", [&] { client.connect(); }, "connected twice");
+    Robot robot(to("ws://127.0.0.1:1/ws"));
+    expect_error("connect", [&] { robot.connect(); }, "no server");
+    expect_error("disconnected", [&] { robot.call("echo", {}).get(); }, "a call without a connection");
+    expect_error("usage", [&] { robot.connect(); }, "connected twice");
 }
 
 std::string answer_401(const std::string& body) {
@@ -92,17 +92,17 @@ void a_refusal_without_the_mark_of_a_server_is_temporary() {
     Server server(answer_401(""));
     Options quick = to(server.url());
     quick.first_tries = 3;
-    expect_error("unauthorized", [&] { Client(quick).connect(); }, "not ours");
+    expect_error("unauthorized", [&] { Robot(quick).connect(); }, "not ours");
     expect(server.connections == 3, "tried again");
 }
 
 void a_refusal_keeps_its_code_and_ends_the_first_connect() {
     Server server(refusal);
-    Client client(to(server.url()));
+    Robot robot(to(server.url()));
     try {
-        client.connect();
+        robot.connect();
         expect(false, "connected");
-    } catch (const Error& error) {
+    } catch (const RsePfError& error) {
         expect(error.code() == "unauthorized" && error.failure().hint == "ask for a token", error.what());
     }
     expect(server.connections == 1, "tried once");
@@ -119,33 +119,33 @@ void a_refusal_names_the_time_from_which_tokens_are_accepted() {
 
 void another_program_answers() {
     Server talks("220 mail.example.org ESMTP\r\n"), is_silent(""), web("HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n");
-    expect_error("connect", [&] { Client(to(talks.url())).connect(); }, "a mail server");
-    expect_error("connect", [&] { Client(to(is_silent.url())).connect(); }, "a silent server");
-    expect_error("unsupported", [&] { Client(to(web.url())).connect(); }, "a web server");
+    expect_error("connect", [&] { Robot(to(talks.url())).connect(); }, "a mail server");
+    expect_error("connect", [&] { Robot(to(is_silent.url())).connect(); }, "a silent server");
+    expect_error("unsupported", [&] { Robot(to(web.url())).connect(); }, "a web server");
     Options tls = to("wss" + is_silent.url().substr(2));
-    expect_error("connect", [&] { Client(tls).connect(); }, "a server without TLS");
+    expect_error("connect", [&] { Robot(tls).connect(); }, "a server without TLS");
     DataOptions quick;
     quick.deadline_s = 0.1;
     expect_error("connect", [&] { DataClient(talks.url(), "", quick).download(sha256("x")); }, "no data service");
 }
 
-void a_token_source_is_asked_again_after_a_refusal() {
+void a_token_function_is_asked_again_after_a_refusal() {
     Server server(refusal);
     Options options = to(server.url());
     std::atomic<int> asked{0};
-    options.token_source = [&] { return "token-" + std::to_string(++asked); };
-    expect_error("unauthorized", [&] { Client(options).connect(); }, "refused");
+    options.token = [&] { return "token-" + std::to_string(++asked); };
+    expect_error("unauthorized", [&] { Robot(options).connect(); }, "refused");
     expect(asked == 2, "a fresh token was tried");
-    options.token_source = []() -> std::string { throw std::runtime_error("no file"); };
-    expect_error("connect", [&] { Client(options).connect(); }, "a source that throws");
+    options.token = []() -> std::string { throw std::runtime_error("no file"); };
+    expect_error("connect", [&] { Robot(options).connect(); }, "a token function that throws");
 }
 
-void a_token_source_that_hangs_is_given_up_and_asked_again() {
+void a_token_function_that_hangs_is_given_up_and_asked_again() {
     Server server(refusal);
     Options options = to(server.url());
     const auto asked = std::make_shared<std::atomic<int>>(0);
     std::promise<void> release;
-    options.token_source = [asked, may_answer = release.get_future().share()] {
+    options.token = [asked, may_answer = release.get_future().share()] {
         ++*asked;
         may_answer.wait();
         return std::string("late");
@@ -170,20 +170,20 @@ void calls_of_many_threads_end_when_the_client_closes() {
     for (int round = 0; round < 5; ++round) {
         std::atomic<int> ended{0};
         {
-            Client client(to(server.url()));
+            Robot robot(to(server.url()));
             std::thread opens([&] {
                 try {
-                    client.connect();
-                } catch (const Error&) {
+                    robot.connect();
+                } catch (const RsePfError&) {
                 }
             });
             std::vector<std::thread> threads;
             for (int i = 0; i < 4; ++i) {
                 threads.emplace_back([&] {
                     for (int k = 0; k < 50; ++k) {
-                        const auto id = client.call("echo", {{"value", k}}, {}, [&](Outcome<Answer>) { ++ended; });
-                        if (k % 7 == 0) client.cancel(id);
-                        if (k % 11 == 0) client.renew("token");
+                        const auto id = robot.call("echo", {{"value", k}}, {}, [&](Outcome<Answer>) { ++ended; });
+                        if (k % 7 == 0) robot.cancel(id);
+                        if (k % 11 == 0) robot.renew("token");
                     }
                 });
             }
@@ -235,36 +235,36 @@ template <class T> bool ends_soon(std::future<T>& result) { return result.wait_f
 
 void callbacks_neither_hold_up_nor_end_the_connection() {
     SpeakingServer server;
-    Client client(to(server.url()));
-    client.connect();
+    Robot robot(to(server.url()));
+    robot.connect();
     std::promise<void> began, release, over;
     auto has_begun = began.get_future(), is_over = over.get_future();
     auto may_end = release.get_future().share();
-    client.subscribe("a", [&](const std::string&, const json&) {
+    robot.subscribe("a", [&](const std::string&, const json&) {
         began.set_value();
         may_end.wait();
         throw std::runtime_error("of a callback");
     });
     expect(ends_soon(has_begun), "an update");
-    auto answered = client.call("echo", 1);
+    auto answered = robot.call("echo", 1);
     expect(ends_soon(answered.result), "an answer while a callback blocks");
     release.set_value();
-    client.call("echo", 2, {}, [&](Outcome<Answer> outcome) {
-        auto own = client.call("echo", 3);
+    robot.call("echo", 2, {}, [&](Outcome<Answer> outcome) {
+        auto own = robot.call("echo", 3);
         expect(outcome.ok() && ends_soon(own.result), "a callback calls its own robot");
-        const Stats stats = client.stats();
+        const Stats stats = robot.stats();
         expect(stats.callback_errors == 1 && stats.last_error == "of a callback", "counted once");
-        client.close();
-        client.close();
+        robot.close();
+        robot.close();
         over.set_value();
     });
     expect(ends_soon(is_over), "a callback closes its client");
     expect(server.commands == 3, "nothing was sent twice");
-    expect_error("disconnected", [&] { client.call("echo", 4).get(); }, "a call after the end");
+    expect_error("disconnected", [&] { robot.call("echo", 4).get(); }, "a call after the end");
 }
 
 void no_exception_of_a_callback_leaves_a_call() {
-    Client client(to("ws://127.0.0.1:1/ws"));
+    Robot robot(to("ws://127.0.0.1:1/ws"));
     std::string codes;
     const auto fails = [&](auto outcome) {
         codes += outcome.failure().code + " ";
@@ -272,16 +272,16 @@ void no_exception_of_a_callback_leaves_a_call() {
     };
     const auto call_twice = [&](const std::string& when) {
         try {
-            client.call("echo", 1, {}, fails);
-            client.pnp({}, {}, fails);
+            robot.call("echo", 1, {}, fails);
+            robot.solve_pnp({}, {}, fails);
         } catch (const std::exception& error) {
             expect(false, when + ": " + error.what());
         }
     };
     call_twice("before connect");
-    client.close();
+    robot.close();
     call_twice("after close");
-    const Stats stats = client.stats();
+    const Stats stats = robot.stats();
     expect(codes == "disconnected disconnected disconnected disconnected ", "each is called once: " + codes);
     expect(stats.callback_errors == 4 && stats.last_error == "of a callback", "counted");
 }
@@ -318,8 +318,8 @@ int main() {
     a_refusal_keeps_its_code_and_ends_the_first_connect();
     a_refusal_names_the_time_from_which_tokens_are_accepted();
     another_program_answers();
-    a_token_source_is_asked_again_after_a_refusal();
-    a_token_source_that_hangs_is_given_up_and_asked_again();
+    a_token_function_is_asked_again_after_a_refusal();
+    a_token_function_that_hangs_is_given_up_and_asked_again();
     calls_of_many_threads_end_when_the_client_closes();
     callbacks_neither_hold_up_nor_end_the_connection();
     no_exception_of_a_callback_leaves_a_call();

@@ -298,7 +298,7 @@ void bytes_of_a_stranger_are_refused() {
             answer.reply_msgpack = std::string(detail::read_message(bad).reply);
             pose_of(answer);
             answer.reply();
-        } catch (const Error&) {
+        } catch (const RsePfError&) {
         }
     }
 }

@@ -63,11 +63,11 @@ async function look(robot, given) {
   const began = performance.now();
   const image = new Uint8Array(await (await frame.convertToBlob({ type: "image/jpeg", quality: JPEG_QUALITY })).arrayBuffer());
   const encodeMs = performance.now() - began;
-  const before = robot.stats.bytesUp;
+  const before = robot.stats.bytesOut;
   try {
     const options = { stream: "camera", deadlineMs: DEADLINE_MS };
     const answer = await robot.call("object-recognition", { image, ...given }, options);
-    const bytes = robot.stats.bytesUp - before;
+    const bytes = robot.stats.bytesOut - before;
     said.textContent = `connected to ${robot.server} as ${robot.robot}`;
     draw(answer.reply.found, given.camera, given.tag_m);
     tell(answer, { encodeMs, jpegBytes: image.length, bytes });

@@ -50,7 +50,7 @@ def test_after_busy_no_frame_of_its_stream_is_sent_before_the_pause_is_over() ->
     const first = await codeOf(robot.call("echo", 1, { stream: "a", deadlineMs: 300 }));
     const fresh = codeOf(robot.call("echo", 2, { stream: "a", keep: true }));
     const other = codeOf(robot.call("echo", 3, { stream: "b" }));
-    say([first, await fresh, await other, robot.stats.heldByBusy]);
+    say([first, await fresh, await other, robot.stats.heldBack.busy]);
     """
     )
 
@@ -115,7 +115,7 @@ def test_what_the_limits_of_the_welcome_hold_back_is_counted_as_own() -> None:
         OPEN
         + """
     await Promise.all([1, 2, 3, 4, 5].map((each) => robot.call("echo", each)));
-    say([robot.stats.heldByLimit, robot.stats.heldByBusy]);
+    say([robot.stats.heldBack["own-limit"], robot.stats.heldBack.busy]);
     """
     )
 

@@ -42,18 +42,18 @@ struct Answer {
     /// One-way delays, known when the clocks of robot and server were compared.
     std::optional<double> up_ms{}, down_ms{};
 
-    /// Return the reply as JSON; arrays are binary values, see `numbers`. Throws Error `bad-message`.
+    /// Return the reply as JSON; arrays are binary values, see `numbers`. Throws RsePfError `bad-message`.
     json reply() const {
         if (reply_msgpack.empty()) return nullptr;
         try {
             return json::from_msgpack(reply_msgpack);
         } catch (const json::exception& error) {
-            throw Error("bad-message", error.what());
+            throw RsePfError("bad-message", error.what());
         }
     }
 };
 
-/// A command that was sent: its id, for `Client::cancel`, and its result; `get()` throws Error.
+/// A command that was sent: its id, for `Robot::cancel`, and its result; `get()` throws RsePfError.
 template <class T> struct Call {
     std::uint64_t id = 0;
     std::future<T> result{};
@@ -72,7 +72,7 @@ inline json array(const std::vector<double>& values) {
                         msgpack::float64);
 }
 
-/// Return the numbers of an array of a reply, or of a plain list; throws Error `bad-message` if it is neither.
+/// Return the numbers of an array of a reply, or of a plain list; throws RsePfError `bad-message` if it is neither.
 inline std::vector<double> numbers(const json& value) {
     const auto encoded = json::to_msgpack(value);
     return msgpack::Reader({reinterpret_cast<const char*>(encoded.data()), encoded.size()}).numbers();

@@ -58,7 +58,7 @@ class DataClient {
             try {
                 const auto piece = bytes.substr(state.offset, part);
                 state = upload_of(request(Verb::patch, path, piece, {"Upload-Offset", std::to_string(state.offset)}));
-            } catch (const Error& error) {  // the answer to a part was lost, or another process sends the same bytes
+            } catch (const RsePfError& error) {  // the answer to a part was lost, or another process sends the same bytes
                 if ((error.code() != "conflict" && error.code() != "not-found") || ++conflicts > 10) throw;
                 state = upload_of(request(Verb::put, path, begin));
             }
@@ -66,10 +66,10 @@ class DataClient {
         return digest;
     }
 
-    /// Return the object of *digest*; throws Error `not-found`, or `store` if the bytes are not those of the digest.
+    /// Return the object of *digest*; throws RsePfError `not-found`, or `store` if the bytes are not those of the digest.
     std::string download(const std::string& digest) {
         std::string bytes = request(Verb::get, "/data/v1/objects/" + digest, {});
-        if (sha256(bytes) != digest) throw Error("store", "the bytes do not match the digest", "fetch it again");
+        if (sha256(bytes) != digest) throw RsePfError("store", "the bytes do not match the digest", "fetch it again");
         return bytes;
     }
 
@@ -87,7 +87,7 @@ class DataClient {
     static Upload upload_of(const std::string& body) {
         const auto told = nlohmann::json::parse(body, nullptr, false);
         if (!told.is_object() || !told.contains("offset") || !told["offset"].is_number_unsigned()) {
-            throw Error("bad-message", "the data service answered something else than an upload");
+            throw RsePfError("bad-message", "the data service answered something else than an upload");
         }
         return {told["offset"].get<std::size_t>(), told.value("part_bytes", std::size_t{1} << 20)};
     }
@@ -108,12 +108,12 @@ class DataClient {
             } else {
                 auto told = detail::refused(address_.shown(), status, std::string(response[detail::http::field::retry_after]), response.body());
                 if (status == 404 && told.failure.code == "unsupported") told.failure.code = "not-found";
-                if (status != 429 && status != 502 && status != 503 && status != 504) throw Error(told.failure);
+                if (status != 429 && status != 502 && status != 503 && status != 504) throw RsePfError(told.failure);
                 failure = std::move(told.failure);
                 after = told.after_s;
             }
             const double wait = std::max(after, pause * std::uniform_real_distribution<double>(0.5, 1)(random_));
-            if (detail::now_s() - begin + wait > options_.deadline_s) throw Error(failure);
+            if (detail::now_s() - begin + wait > options_.deadline_s) throw RsePfError(failure);
             std::this_thread::sleep_for(std::chrono::duration<double>(wait));
         }
     }

@@ -20,14 +20,14 @@ struct Failure {
 };
 
 /// The exception of this client; it carries a `Failure`.
-class Error : public std::runtime_error {
+class RsePfError : public std::runtime_error {
   public:
-    explicit Error(Failure failure)
+    explicit RsePfError(Failure failure)
         : std::runtime_error(failure.code + ": " + failure.message +
                              (failure.hint.empty() ? "" : "\n  hint: " + failure.hint)),
           failure_(std::move(failure)) {}
-    Error(std::string code, std::string message, std::string hint = {})
-        : Error(Failure{std::move(code), std::move(message), std::move(hint)}) {}
+    RsePfError(std::string code, std::string message, std::string hint = {})
+        : RsePfError(Failure{std::move(code), std::move(message), std::move(hint)}) {}
 
     const Failure& failure() const noexcept { return failure_; }
     const std::string& code() const noexcept { return failure_.code; }
@@ -45,13 +45,13 @@ template <class T> class Outcome {
     bool ok() const noexcept { return state_.index() == 0; }
     explicit operator bool() const noexcept { return ok(); }
 
-    /// Return the value; throws Error if there is none.
+    /// Return the value; throws RsePfError if there is none.
     const T& value() const& {
-        if (!ok()) throw Error(std::get<1>(state_));
+        if (!ok()) throw RsePfError(std::get<1>(state_));
         return std::get<0>(state_);
     }
     T&& value() && {
-        if (!ok()) throw Error(std::get<1>(state_));
+        if (!ok()) throw RsePfError(std::get<1>(state_));
         return std::get<0>(std::move(state_));
     }
     /// Return the failure; call it only if `ok()` is false.

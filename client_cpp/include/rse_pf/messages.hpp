@@ -43,7 +43,7 @@ inline Limits read_limits(msgpack::Reader& reader) {
     return limits;
 }
 
-/// Return the message in *data*, whose strings point into it; throws Error `bad-message`.
+/// Return the message in *data*, whose strings point into it; throws RsePfError `bad-message`.
 inline ServerMessage read_message(std::string_view data) {
     msgpack::Reader reader(data);
     ServerMessage out;
@@ -85,7 +85,7 @@ inline ServerMessage read_message(std::string_view data) {
         else if (key == "what") text(out.what);
         else reader.value();
     }
-    if (!reader.done()) throw Error("bad-message", "bytes follow the message");
+    if (!reader.done()) throw RsePfError("bad-message", "bytes follow the message");
     return out;
 }
 

@@ -94,7 +94,7 @@ class Writer {
     std::string& out_;
 };
 
-/// Read MessagePack; every method throws Error `bad-message` when the bytes are something else.
+/// Read MessagePack; every method throws RsePfError `bad-message` when the bytes are something else.
 class Reader {
   public:
     explicit Reader(std::string_view data) : at_(data.data()), end_(data.data() + data.size()) {}
@@ -178,7 +178,7 @@ class Reader {
     }
 
   private:
-    static Error wrong(const char* expected) {
+    static RsePfError wrong(const char* expected) {
         return {"bad-message", std::string("the message does not hold ") + expected + " where the protocol has one"};
     }
     unsigned peek() const {

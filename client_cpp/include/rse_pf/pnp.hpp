@@ -42,7 +42,7 @@ struct PnpRequest {
 };
 
 /// The pose of one image.
-struct Pose {
+struct PoseAnswer {
     /// Row-major 4x4: maps world points into the camera's frame (x right, y down, z forward).
     std::array<double, 16> T_camera_world{};
     std::vector<std::uint32_t> inliers{};  ///< sorted row numbers, from 0
@@ -58,11 +58,11 @@ struct Pose {
     bool ok() const { return verdict == "ok"; }
 };
 
-/// Return the request in MessagePack; throws Error `usage` if it has not as many pixels (or depths) as points.
+/// Return the request in MessagePack; throws RsePfError `usage` if it has not as many pixels (or depths) as points.
 inline std::string encoded(const PnpRequest& request) {
     const std::size_t n = request.points_world.size();
     if (request.pixels.size() != n || (!request.depths_m.empty() && request.depths_m.size() != n)) {
-        throw Error("usage", std::to_string(n) + " points and " + std::to_string(request.pixels.size()) + " pixels do not match",
+        throw RsePfError("usage", std::to_string(n) + " points and " + std::to_string(request.pixels.size()) + " pixels do not match",
                     "give one pixel, and one depth or none at all, for each point");
     }
     std::string out;
@@ -99,12 +99,12 @@ inline std::string encoded(const PnpRequest& request) {
     return out;
 }
 
-/// Return the pose in an answer of `pnp`; throws Error `bad-message` if it holds none.
-inline Pose pose_of(const Answer& answer) {
-    Pose pose;
+/// Return the pose in an answer of `pnp`; throws RsePfError `bad-message` if it holds none.
+inline PoseAnswer pose_of(const Answer& answer) {
+    PoseAnswer pose;
     msgpack::Reader reader(answer.reply_msgpack);
     const auto fill = [](auto& array, const std::vector<double>& values) {
-        if (values.size() != array.size()) throw Error("bad-message", "the pose has another number of elements");
+        if (values.size() != array.size()) throw RsePfError("bad-message", "the pose has another number of elements");
         std::copy(values.begin(), values.end(), array.begin());
     };
     bool has_pose = false;
@@ -121,7 +121,7 @@ inline Pose pose_of(const Answer& answer) {
             for (const double row : reader.numbers()) pose.inliers.push_back(row >= 0 && row < 4294967296.0 ? static_cast<std::uint32_t>(row) : 0);
         } else reader.value();
     }
-    if (!has_pose) throw Error("bad-message", "the reply holds no pose");
+    if (!has_pose) throw RsePfError("bad-message", "the reply holds no pose");
     pose.queue_ms = answer.queue_ms;
     pose.compute_ms = answer.compute_ms;
     pose.round_trip_ms = answer.round_trip_ms;

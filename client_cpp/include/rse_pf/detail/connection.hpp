@@ -9,6 +9,7 @@
 #include <string>
 #include <thread>
 #include <utility>
+#include <variant>
 
 #include "http_answer.hpp"
 #include "session.hpp"
@@ -16,27 +17,26 @@
 
 namespace rse_pf {
 
-/// A token, or a function that returns a fresh one for each connection and each renewal. The function is called on a
-/// thread of its own, one call at a time; what it throws counts as "no token", and so does a call that takes more than
-/// 30 s: its answer is ignored, and the next call does not wait for it.
-using TokenSource = std::function<std::string()>;
+/// The robot's token (empty: none), or a function that returns a fresh token for each connection and each renewal. The
+/// function is called on a thread of its own, one call at a time. A call that throws or takes more than 30 s counts as
+/// failed: a later answer of that call is ignored, and the next call does not wait for it.
+using Token = std::variant<std::string, std::function<std::string()>>;
 
-/// What changed: `connected`, `lost`, `moved`, `refused` or `ended`, and the server's name or the reason. A client that
-/// was connected once tries again for ever; `refused` says why its servers do not take it, and `ended` that it was closed
-/// or never connected.
+/// Receives what changed: `link-lost` or `refused` and the reason, `link-back` or `moved` and the name of the server. The
+/// first connection is not reported: `Robot::connect` returns or throws. A robot that was connected once reconnects for
+/// ever; `refused` says why its servers refuse it.
 using OnChange = std::function<void(const std::string& what, const std::string& why)>;
 
 /// Where a client connects, and how.
 struct Options {
     std::string url{};             ///< ws://HOST:PORT/ws or wss://HOST/ws
-    std::string token{};           ///< the robot's token; empty: none, or `token_source`
-    TokenSource token_source{};    ///< gives fresh tokens; without it, a connection ends when its token expires
+    Token token{};                 ///< a connection with a fixed token is closed when the token expires
     std::string sdk = "rse-pf-cpp/1";  ///< name and version of the program, for the server's log
     std::string ca_file{};         ///< authorities to trust, in PEM; empty: the machine's
     double connect_timeout_s = 2, reconnect_base_s = 0.1, reconnect_max_s = 1;
     double reconnect_long_max_s = 40;  ///< longest pause after minutes without a connection; after a refusal half of it at least
     double answer_timeout_s = 5;   ///< deadline of a command that sets none
-    int first_tries = 4;           ///< attempts of `Client::connect` before it gives up
+    int first_tries = 4;           ///< attempts of `Robot::connect` before it gives up
     OnChange on_change{};          ///< called on the thread of callbacks
 };
 
@@ -59,8 +59,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
   public:
     Connection(Options options, SessionTimes times)
         : session(times, options.sdk), options_(std::move(options)), address_(address_of(options_.url)),
-          tls_(tls_context(address_, {options_.ca_file})), token_(options_.token), token_timeout_s_(times.token_timeout), tick_(io), retry_(io), token_timer_(io), resolver_(io), random_(std::random_device{}()) {
+          tls_(tls_context(address_, {options_.ca_file})), token_timeout_s_(times.token_timeout), tick_(io), retry_(io), token_timer_(io), resolver_(io), random_(std::random_device{}()) {
         if (address_.target.empty()) address_.target = "/ws";
+        if (const auto* fixed = std::get_if<std::string>(&options_.token)) token_ = *fixed;
     }
     ~Connection() {
         if (token_thread_.joinable()) token_thread_.detach();
@@ -147,10 +148,10 @@ class Connection : public std::enable_shared_from_this<Connection> {
     void dial() {
         if (shut_ || fatal || dialing_ || token_pending_) return;
         dial_began_ = now_s();
-        if (options_.token_source) {
+        if (has_token_function()) {
             ask_token([this](std::optional<std::string> token) {
                 if (token) connect_socket(*token);
-                else dial_failed({{"connect", "no token: the token source failed: " + token_error_, "fix the token source"}});
+                else dial_failed({{"connect", "no token: the token function failed: " + token_error_, "fix the function in options.token"}});
             });
         } else {
             connect_socket(token_);
@@ -263,7 +264,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     void dial_failed(DialFailure failed) {
         session.stats.last_error = failed.failure.message;
         if (shut_) return;
-        if (failed.is_refusal && !failed.refuses_any && options_.token_source && failed.failure.code == "unauthorized" && !std::exchange(asked_again_, true)) {
+        if (failed.is_refusal && !failed.refuses_any && has_token_function() && failed.failure.code == "unauthorized" && !std::exchange(asked_again_, true)) {
             failed.is_refusal = false;
         }
         const bool first = on_open_ != nullptr;
@@ -344,7 +345,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
         session.adopt(channel->link, adopted_);
         if (moved) ++session.stats.moves;
         else if (!on_open_) ++session.stats.reconnects;
-        changed(moved ? "moved" : "connected", channel->link->server);
+        if (moved) changed("moved", channel->link->server);
+        else if (!on_open_) changed("link-back", channel->link->server);
         opened(std::nullopt);
     }
 
@@ -367,7 +369,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         const auto data = channel->buffer.cdata();
         Heard heard;
         try {
-            if (!channel->ws.got_binary()) throw Error("bad-message", "the server sent text");
+            if (!channel->ws.got_binary()) throw RsePfError("bad-message", "the server sent text");
             heard = session.receive(channel->link, {static_cast<const char*>(data.data()), data.size()}, now_s());
         } catch (const std::exception& error) {
             session.stats.last_error = error.what();
@@ -434,14 +436,14 @@ class Connection : public std::enable_shared_from_this<Connection> {
         const auto code = channel->ws.reason().code;
         const std::string reason(channel->ws.reason().reason.data(), channel->ws.reason().reason.size());
         DialFailure ends{refusal_of(code, reason)};
-        if (code == 4401 && !options_.token_source && channel->token == token_) {
-            ends.failure = {"unauthorized", "the token has expired", "give a token_source, or call renew in time"};
+        if (code == 4401 && !has_token_function() && channel->token == token_) {
+            ends.failure = {"unauthorized", "the token has expired", "set options.token to a function, or call renew in time"};
         }
         // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
-        if (code == 4403 && options_.token_source) ends.valid_from = wall_s() + 1;
+        if (code == 4403 && has_token_function()) ends.valid_from = wall_s() + 1;
         if (!ends.failure.code.empty() && (was_dialing || was_current)) {
             ends.is_refusal = ends.refuses_any = true;
-            if (was_current) changed("lost", ends.failure.message);
+            if (was_current) changed("link-lost", ends.failure.message);
             if (was_current && now_s() - adopted_ > 10) restart_pauses();
             dial_failed(ends);
             pump();
@@ -451,7 +453,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
             dial_failed({{"connect", address_.shown() + " sent no Welcome: " + why, "is it an RSE-PF server?"}});
         } else if (was_current) {
             session.stats.last_error = why;
-            changed("lost", why);
+            changed("link-lost", why);
             if (now_s() - adopted_ > 10) restart_pauses();
             retry_in(code == 4429 ? 6 : pause_s());
         }
@@ -464,7 +466,6 @@ class Connection : public std::enable_shared_from_this<Connection> {
         session.stats.last_error = failure.message;
         session.abandon(failure);
         if (dialing_) drop(dialing_);
-        changed("ended", failure.code);
         opened(failure);
         if (channel_) close(channel_);
     }
@@ -473,6 +474,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
         const auto on_open = std::exchange(on_open_, nullptr);
         if (on_open) on_open(std::move(failure));
     }
+
+    bool has_token_function() const { return options_.token.index() == 1; }
 
     void changed(const char* what, const std::string& why) { session.tell(options_.on_change, std::string(what), why); }
 
@@ -493,7 +496,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         for (const auto& each : all) {
             bool renewal = false;
             if (const char* why = session.check(each->link, now, renewal)) lost(each, why);
-            else if (renewal && options_.token_source && each == channel_ && !token_pending_) renew_from_source();
+            else if (renewal && has_token_function() && each == channel_ && !token_pending_) renew_from_function();
         }
         pump();
         schedule_tick();
@@ -508,14 +511,14 @@ class Connection : public std::enable_shared_from_this<Connection> {
         });
     }
 
-    void renew_from_source() {
+    void renew_from_function() {
         ask_token([this](std::optional<std::string> token) {
             if (token) use_token(*token);
             if (!channel_ || now_s() < move_until_) retry_in(pause_s());
         });
     }
 
-    /// Call the token source on a thread of its own; the answer comes back to this one.
+    /// Call the token function on a thread of its own; the thread of the connection handles the token.
     void ask_token(std::function<void(std::optional<std::string>)> then) {
         token_pending_ = true;
         const auto number = ++token_calls_;
@@ -527,7 +530,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
             self->token_thread_.detach();
             self->answered(std::nullopt, "no answer in time", then);
         });
-        token_thread_ = std::thread([self, number, then = std::move(then), source = options_.token_source] {
+        token_thread_ = std::thread([self, number, then = std::move(then), source = std::get<std::function<std::string()>>(options_.token)] {
             std::optional<std::string> token;
             std::string error;
             try {
@@ -544,7 +547,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         });
     }
 
-    /// Return whether call *number* of the token source has no answer yet, and was not given up.
+    /// Return whether call *number* of the token function has no answer yet, and was not given up.
     bool is_awaited(std::uint64_t number) const { return token_pending_ && number == token_calls_; }
 
     void answered(const std::optional<std::string>& token, const std::string& error, const std::function<void(std::optional<std::string>)>& then) {

@@ -181,7 +181,7 @@ class Session {
         }
     }
 
-    /// Take one message of the server; throws Error `bad-message`.
+    /// Take one message of the server; throws RsePfError `bad-message`.
     Heard receive(const std::shared_ptr<Link>& link, std::string_view data, double now) {
         link->last_heard = now;
         const ServerMessage message = read_message(data);
@@ -209,7 +209,7 @@ class Session {
         }
         if (type == "update") updated(link, message);
         else if (type == "progress") progressed(link, message);
-        else throw Error("bad-message", "a message of a type that the protocol does not have");
+        else throw RsePfError("bad-message", "a message of a type that the protocol does not have");
         return {};
     }
 

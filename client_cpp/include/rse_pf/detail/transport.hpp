@@ -41,9 +41,9 @@ struct Address {
     }
 };
 
-/// Return the parts of *url*; throws Error `usage` if it is no address, or carries a user or a query.
+/// Return the parts of *url*; throws RsePfError `usage` if it is no address, or carries a user or a query.
 inline Address address_of(const std::string& url) {
-    const Error wrong("usage", "this is not an address of a server", "write wss://HOST/ws or ws://HOST:PORT/ws");
+    const RsePfError wrong("usage", "this is not an address of a server", "write wss://HOST/ws or ws://HOST:PORT/ws");
     const auto colon = url.find("://");
     if (colon == std::string::npos) throw wrong;
     const std::string scheme = url.substr(0, colon);
@@ -70,7 +70,7 @@ struct Trust {
     std::string ca_file{};
 };
 
-/// Return what checks the server's certificate and name; throws Error `usage` if the file cannot be read.
+/// Return what checks the server's certificate and name; throws RsePfError `usage` if the file cannot be read.
 inline std::shared_ptr<asio::ssl::context> tls_context(const Address& address, const Trust& trust) {
     if (!address.secure) return nullptr;
     auto context = std::make_shared<asio::ssl::context>(asio::ssl::context::tls_client);
@@ -79,7 +79,7 @@ inline std::shared_ptr<asio::ssl::context> tls_context(const Address& address, c
     error_code failed;
     if (trust.ca_file.empty()) context->set_default_verify_paths(failed);
     else context->load_verify_file(trust.ca_file, failed);
-    if (failed) throw Error("usage", "the file of trusted authorities cannot be read", "ca_file names a file in PEM");
+    if (failed) throw RsePfError("usage", "the file of trusted authorities cannot be read", "ca_file names a file in PEM");
     return context;
 }
 

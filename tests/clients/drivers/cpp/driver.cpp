@@ -172,11 +172,11 @@ class Driver {
         if (!path.empty()) input = read_json(path);
         rse_pf::Options options;
         options.url = variable("RSE_PF_URL");
-        if (signs_itself) options.token_source = [own = input["own_key"]] { return signed_token(own); };
+        if (signs_itself) options.token = [own = input["own_key"]] { return signed_token(own); };
         else options.token = variable("RSE_PF_TOKEN");
         options.on_change = [this](const std::string& what, const std::string& why) {
             if (what == "moved") say({{"event", "moved"}, {"server", why}});
-            if (what == "connected" && was_connected_.exchange(true)) say({{"event", "back"}});
+            if (what == "link-back") say({{"event", "back"}});
             if (what == "refused") {
                 say({{"event", "refused"}, {"why", why}});
                 const std::lock_guard lock(mutex_);
@@ -184,7 +184,7 @@ class Driver {
                 over_.notify_all();
             }
         };
-        client = std::make_unique<rse_pf::Client>(options);
+        client = std::make_unique<rse_pf::Robot>(options);
         for (auto& command : input["commands"]) command["payload"] = with_arrays(command["payload"]);
     }
     void connect() {
@@ -215,10 +215,9 @@ class Driver {
     std::mutex mutex_;
     std::condition_variable over_;
     std::string ended_;
-    std::atomic<bool> was_connected_{false};
 
   public:
-    std::unique_ptr<rse_pf::Client> client;  // the last member: it ends first, and its callbacks with it
+    std::unique_ptr<rse_pf::Robot> client;  // the last member: it ends first, and its callbacks with it
 };
 
 /// Return *value* with plain lists in place of arrays.
@@ -283,7 +282,7 @@ void pnp(Driver& driver) {
         const Outcome<Answer> outcome = driver.tally.outcome(i);
         const json& expected = driver.input["expected"][i];
         if (expected.is_null()) continue;
-        const rse_pf::Pose pose = rse_pf::pose_of(outcome.value());
+        const rse_pf::PoseAnswer pose = rse_pf::pose_of(outcome.value());
         for (std::size_t k = 0; k < 16; ++k) worst = std::max(worst, std::abs(pose.T_camera_world[k] - expected["T_camera_world"][k].get<double>()));
         if (expected.contains("verdict")) require(pose.verdict == expected["verdict"].get<std::string>(), "another verdict");
     }
@@ -342,7 +341,7 @@ void busy(Driver& driver) {
     const auto end = Clock::now() + std::chrono::duration<double>(std::stod(variable("RSE_PF_SECONDS")));
     std::size_t n = 0;
     for (; Clock::now() < end; ++n) {
-        driver.send(n, rse_pf::Client::in_stream("offered"));  // four times the limits of 20 a second
+        driver.send(n, rse_pf::Robot::in_stream("offered"));  // four times the limits of 20 a second
         wait(1 / 80.0);
     }
     require(driver.tally.all_ended(10), "commands without an end");
@@ -364,7 +363,7 @@ void newest(Driver& driver, json& more) {
     driver.connect();
     bool newest_ok = true;
     for (std::size_t burst = 0; burst < 4; ++burst) {
-        for (std::size_t i = 0; i < 12; ++i) driver.send(0, rse_pf::Client::in_stream("front"));  // 8 are sent
+        for (std::size_t i = 0; i < 12; ++i) driver.send(0, rse_pf::Robot::in_stream("front"));  // 8 are sent
         newest_ok = newest_ok && driver.tally.outcome(12 * burst + 11).ok();
         wait(0.5);
     }

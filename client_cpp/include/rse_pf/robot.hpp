@@ -18,26 +18,26 @@
 
 namespace rse_pf {
 
-class Client {
+class Robot {
   public:
-    /// Store how to connect; nothing is opened yet. Throws Error `usage` if the address cannot be used.
-    explicit Client(Options options)
+    /// Store how to connect; nothing is opened yet. Throws RsePfError `usage` if the address cannot be used.
+    explicit Robot(Options options)
         : callbacks_(std::make_shared<detail::Callbacks>()), core_(std::make_shared<Core>(with_deferred(std::move(options)))) {}
 
-    ~Client() { close(); }
-    Client(const Client&) = delete;
-    Client& operator=(const Client&) = delete;
+    ~Robot() { close(); }
+    Robot(const Robot&) = delete;
+    Robot& operator=(const Robot&) = delete;
 
-    /// Connect and wait until a server answered; throws Error if none does, or if it refuses. Call it once. A client that
+    /// Connect and wait until a server answered; throws RsePfError if none does, or if it refuses. Call it once. A client that
     /// was connected once connects again for ever, whatever its servers say; while they refuse it, calls end with the reason.
     void connect() {
-        if (core_->started.exchange(true)) throw Error("usage", "connect was called twice", "make another client");
+        if (core_->started.exchange(true)) throw RsePfError("usage", "connect was called twice", "make another client");
         auto opened = std::make_shared<std::promise<std::optional<Failure>>>();
         auto result = opened->get_future();
         const bool posted = post([core = core_, opened] {
             core->connection->open([opened](std::optional<Failure> failure) { opened->set_value(std::move(failure)); });
         });
-        if (!posted) throw Error("disconnected", "the client was closed", "make another client");
+        if (!posted) throw RsePfError("disconnected", "the client was closed", "make another client");
         {
             const std::lock_guard one_at_a_time(core_->posting);
             thread_ = std::thread([core = core_] {
@@ -48,7 +48,7 @@ class Client {
         }
         if (auto failure = result.get()) {
             close();
-            throw Error(std::move(*failure));
+            throw RsePfError(std::move(*failure));
         }
     }
 
@@ -92,13 +92,13 @@ class Client {
     }
 
     /// Estimate the pose of one image. In a stream (here `pose`) the newest image wins.
-    Call<Pose> pnp(const PnpRequest& request, CallOptions options = in_stream("pose")) {
-        auto promise = std::make_shared<std::promise<Pose>>();
+    Call<PoseAnswer> solve_pnp(const PnpRequest& request, CallOptions options = in_stream("pose")) {
+        auto promise = std::make_shared<std::promise<PoseAnswer>>();
         auto result = promise->get_future();
         const auto id = submit("pnp", encoded(request), std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, pose_in(outcome)); });
         return {id, std::move(result)};
     }
-    std::uint64_t pnp(const PnpRequest& request, CallOptions options, OnEnd<Pose> on_end) {
+    std::uint64_t solve_pnp(const PnpRequest& request, CallOptions options, OnEnd<PoseAnswer> on_end) {
         return send("pnp", encoded(request), std::move(options), [on_end = std::move(on_end)](Outcome<Answer> outcome) {
             if (on_end) on_end(pose_in(outcome));
         });
@@ -218,13 +218,13 @@ class Client {
 
     template <class T> static void settle(std::promise<T>& promise, Outcome<T> outcome) {
         if (outcome.ok()) promise.set_value(std::move(outcome).value());
-        else promise.set_exception(std::make_exception_ptr(Error(outcome.failure())));
+        else promise.set_exception(std::make_exception_ptr(RsePfError(outcome.failure())));
     }
-    static Outcome<Pose> pose_in(const Outcome<Answer>& outcome) {
+    static Outcome<PoseAnswer> pose_in(const Outcome<Answer>& outcome) {
         if (!outcome.ok()) return outcome.failure();
         try {
             return pose_of(outcome.value());
-        } catch (const Error& error) {
+        } catch (const RsePfError& error) {
             return error.failure();
         }
     }
