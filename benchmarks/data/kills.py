@@ -1,12 +1,12 @@
-"""SIGKILL at each step of a PUT and of an upload in parts: what was acknowledged is there, and nothing else.
+"""Kill a data service at each step of a PUT and of an upload in parts: acknowledged objects must be whole.
 
     python -m benchmarks data.kills [--kills 500] [--seed 1]
 
-A data service, forked from this process, kills itself at one of the calls by which its threads change the
-store: before it, after it, or in the middle of a write.  The next one goes on in the same folder.  After each
-kill all objects are read.
+A data service, forked from this process, sends itself SIGKILL at one of the system calls that change the
+store: before the call, after it, or in the middle of a write.  The next service starts in the same folder.
+All objects of the store are read after every tenth kill and after the last two.
 
-Defends: every object that was acknowledged is there and whole, and no other bytes are visible as an object.
+Defends: every acknowledged object is in the store and whole, and no partial object is visible.
 """
 
 from __future__ import annotations
@@ -27,31 +27,35 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.data.requests import HERE, KEY, token_of
 from benchmarks.frame.registry import Bar, benchmark
-from rse_pf.config import PlatformSettings
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.data_server.routes import openapi_page
 from rse_pf.data_server.server import KeysFile, serve_data
 from rse_pf.storage.object_store import DirectoryStore
 
+ROOT = Path(__file__).resolve().parents[2]
+KEY = SigningKey.from_seed(b"k" * 32, "key-1")
 CALLS = (
     "open", "write", "pwrite", "fsync", "replace", "rename", "mkdir", "close", "unlink", "rmdir", "ftruncate",
-
 )  # fmt: skip
-LAST_CALL, PUTS, PART_BYTES = 90, 4, 100_000
-_TIMEOUT_S = 30.0
+"""Functions of `os` at which a service may be killed."""
+LAST_CALL = 90  # a service is killed at one of its first 89 calls
+PUTS = 4  # objects that are sent whole before each upload in parts
+PART_BYTES = 100_000  # size of each part of an upload
+TIMEOUT_S = 30.0  # longest wait for an answer of the service, and for its start
 
 
 def die_at(number: int, place: int) -> None:
-    """Let the call *number* of the threads of this service kill it: before (0), after (1) or within (2)."""
-    counted = [0]
+    """Kill this process at call *number* of its data threads: before it (0), after (1) or within it (2)."""
+    calls = [0]
 
     def patched(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def run(*arguments: Any, **named: Any) -> Any:
             if threading.current_thread().name != "data":
                 return call(*arguments, **named)
-            counted[0] += 1
-            is_last = counted[0] == number
+            calls[0] += 1
+            is_last = calls[0] == number
             if is_last and place == 2 and name in ("write", "pwrite"):
                 handle, data, *rest = arguments
                 call(handle, data[: len(data) // 2], *rest)
@@ -85,9 +89,10 @@ def serve(folder: Path, number: int, place: int) -> None:
 
 
 def send(port: int, robot: str, source: random.Random) -> Iterator[tuple[str, bool]]:
-    """Send objects; yield the digest of each before it is sent, and again when it was acknowledged."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_TIMEOUT_S)
-    token = {"Authorization": f"Bearer {token_of(robot)}"}
+    """Send objects; yield each digest with False before it is sent, and with True once it is acknowledged."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT_S)
+    bearer = KEY.issue(robot, now=time.time(), token_id="t", settings=AuthSettings())
+    token = {"Authorization": f"Bearer {bearer}"}
 
     def ask(method: str, path: str, body: bytes, **headers: str) -> int:
         connection.request(method, path, body, token | headers)
@@ -115,7 +120,7 @@ def send(port: int, robot: str, source: random.Random) -> Iterator[tuple[str, bo
 
 
 def check(folder: Path, sent: set[str], acknowledged: set[str]) -> list[str]:
-    """Return what is wrong with the objects in the store."""
+    """Return a sentence for each object with other bytes than were sent, and for each that is lost."""
     store, seen, wrong = DirectoryStore(folder / "objects"), set(), []
     for info in store.list("objects/"):
         digest = info.name.rpartition("/")[2]
@@ -127,11 +132,11 @@ def check(folder: Path, sent: set[str], acknowledged: set[str]) -> list[str]:
 
 @benchmark(Bar("wrong", equals=[]))
 def run_benchmark(*, kills: int = 500, seed: int = 1) -> dict[str, Any]:
-    """Kill, and check all objects."""
+    """Kill *kills* services, one after the other, and check the objects of the store."""
     source, sent, acknowledged = random.Random(seed), set[str](), set[str]()
     wrong: list[str] = []
-    (HERE / "build").mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=HERE / "build") as made:
+    (ROOT / "build").mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=ROOT / "build") as made:
         folder = Path(made)
         (folder / "keys.json").write_text(KEY.key_set().to_json())
         openapi_page()  # once, not in each service
@@ -146,7 +151,7 @@ def run_benchmark(*, kills: int = 500, seed: int = 1) -> dict[str, Any]:
                     traceback.print_exc()
                     os._exit(1)
             source.random()
-            until = time.monotonic() + _TIMEOUT_S
+            until = time.monotonic() + TIMEOUT_S
             while not announcement.exists() and time.monotonic() < until:  # a child that ended has a message
                 time.sleep(0.002)  # polls, with a deadline
             port = json.loads(announcement.read_text())["port"]

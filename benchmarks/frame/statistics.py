@@ -1,18 +1,16 @@
-"""Statistics of benchmarks: the one percentile, and pairs of runs that take turns."""
+"""Statistics of benchmarks: percentiles, and the median ratio of pairs of runs."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
 from rse_pf.extensions.experiments.results.summary import percentiles
 
-__all__ = ["interleaved", "median_ratio", "percentile", "spread"]
-
-Way = TypeVar("Way")
+__all__ = ["median_ratio", "percentile", "spread"]
 
 
 def percentile(values: Any, percent: Any, axis: int | None = None) -> Any:
@@ -25,16 +23,6 @@ def percentile(values: Any, percent: Any, axis: int | None = None) -> Any:
 def spread(values: Iterable[float]) -> dict[str, float | int | None]:
     """Return n, mean, p50, p95, p99 and max, to three digits; None without any value."""
     return percentiles([float(value) for value in values])
-
-
-def interleaved(ways: Sequence[Way], rounds: int) -> Iterator[tuple[int, Way]]:
-    """Yield round and way, all ways in each round; every second round begins with the last way.
-
-    What else happens on the machine then disturbs all ways alike, and none is always first.
-    """
-    for number in range(rounds):
-        for way in reversed(ways) if number % 2 else ways:
-            yield number, way
 
 
 def median_ratio(values: Sequence[float], bases: Sequence[float]) -> float:

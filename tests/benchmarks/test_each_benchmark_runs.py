@@ -22,7 +22,6 @@ CANNOT_MEASURE = 2  # the exit code where a program or a folder is missing
 RUNS = {
     "check.table": (["--seeds", "1", "--frames", "16", "--only", "dark"], "by_fault.dark.n"),
     "data.kills": (["--kills", "6"], "acknowledged"),
-    "data.requests": (["--rounds", "1", "--only", "small"], "medians.here.get_p50_ms"),
     "hostile.one_tenant": (["--pairs", "1", "--seconds", "3", "--only", "leave"], "leave.p99_ms.pose.0"),
     "hostile.tenants": (["--commands", "300"], "commands.acme"),
     "live.one_process": (["growth", "--keyframes", "300"], "wide.keyframes"),

@@ -30,7 +30,7 @@ from rse_pf.storage.object_store import DirectoryStore
 from tests.kit.documentation_pages import PAGES
 
 OTHER_PROGRAMS = (
-    "npx", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
+    "npx", "node", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
     "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",
     "rse-pf-ros", "export", "pip", "python3.11", "ros2", "sleep", "umask", "curl", "kill",
 )  # fmt: skip
