@@ -36,8 +36,8 @@ SOON_S = 120.0
 WHILE_A_PLATFORM_RUNS = (
     "docs/local.md", "docs/fleet_page.md", "docs/howto/robot_keys.md", "docs/howto/load_and_faults.md",
 )  # fmt: skip
-RUN_BY_OTHERS = ("docs/operations.md",)
-"""Pages whose blocks another test runs: `tests/stacks/test_operations.py`."""
+RUN_BY_OTHERS = ("docs/operations.md", "docs/howto/own_extension.md")
+"""Pages whose blocks `tests/stacks/test_operations.py` and `tests/docs/test_own_extension.py` run."""
 RUN_BY_CI = ("make demo", "make test", ". .venv/bin/activate", "cd ")
 """`.ci/run` executes them; here the environment is active already."""
 EXECUTED_IN = {
