@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rse_pf.extensions.fleet_page.feeds.events import EVENTS
+from rse_pf.local.events import EVENTS
 
 
 def test_every_kind_of_event_is_explained(repository: Path) -> None:

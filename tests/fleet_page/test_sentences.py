@@ -5,8 +5,8 @@ from __future__ import annotations
 import random
 
 from rse_pf.config import ScalingSettings
-from rse_pf.extensions.fleet_page.feeds.events import event_sentence
 from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
+from rse_pf.local.events import event_sentence
 from rse_pf.scaling.policy import FleetState, decide
 from rse_pf.scaling.rules import Sample
 

@@ -16,7 +16,6 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError
-from rse_pf.extensions.fleet_page.clouds import packer
 from rse_pf.maps.describe import describe_map
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
@@ -153,8 +152,6 @@ def test_a_pose_graph_of_absurd_information_is_a_typed_refusal(number: str, at: 
 
 
 @pytest.mark.parametrize("name", sorted(hostile_maps()))
-def test_what_describes_draws_and_exports_a_map_refuses_or_survives_it(name: str) -> None:
-    data = hostile_maps()[name]
-    for read in (lambda: describe_map(data, 1 << 28), lambda: packer("")(data)):
-        with contextlib.suppress(RsePfError):
-            read()
+def test_what_describes_a_map_refuses_or_survives_it(name: str) -> None:
+    with contextlib.suppress(RsePfError):
+        describe_map(hostile_maps()[name], 1 << 28)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from rse_pf.config import PlatformSettings
 from rse_pf.extensions.costs.bill import bill_of
 from rse_pf.extensions.costs.prices import load_prices
 
@@ -49,6 +50,12 @@ def test_a_line_of_the_bill_counts_what_the_templates_have(assembly: Assembly, w
     lines = [each for each in bill.lines if each.what.removesuffix(", of 10 s") == what]
 
     assert sum(line.count for line in lines) == COUNTED[what](assembly) > 0
+
+
+def test_the_bill_of_the_small_profile_has_the_endpoints_of_one_zone() -> None:
+    bill = bill_of(PlatformSettings.from_dict({"cloud": {"profile": "small"}}), load_prices())
+
+    assert sum(line.count for line in bill.lines if line.what.startswith("endpoint of")) == 2 * 730
 
 
 def test_nothing_that_is_paid_by_the_hour_is_missing_from_the_bill(assembly: Assembly) -> None:

@@ -33,7 +33,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -59,6 +59,7 @@ from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
 
 if TYPE_CHECKING:
+    from rse_pf.local.control.platform_recorder import PlatformRecorder
     from rse_pf.local.state import PlatformState
 
 __all__ = ["ACTION", "DEFAULT_NAME", "PlatformRequest"]
@@ -228,13 +229,14 @@ def start(request: _StartRequest, settings: PlatformSettings) -> int:
     folder = request.folder
     require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
-    from rse_pf.extensions.recording.writer import with_recordings
 
     overrides = {"servers": request.servers, "port": request.port, "metrics_port": request.metrics_port}
     chosen = settings.replace(local={name: value for name, value in overrides.items() if value is not None})
-    chosen = with_recordings(
-        _with_services(chosen, request.services, request.accept_weak_isolation), request.record
-    )
+    chosen = _with_services(chosen, request.services, request.accept_weak_isolation)
+    if request.record is not None or chosen.recording.folder:
+        from rse_pf.extensions.recording.writer import with_recordings
+
+        chosen = with_recordings(chosen, request.record)
     if request.rosbridge:
         chosen = chosen.replace(serving={"rosbridge": True})
     lan = chosen_address(request.lan)
@@ -502,10 +504,9 @@ async def _foreground(
     name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, extras: _Extras
 ) -> int:  # fmt: skip
     """Run the platform *name* in *folder* until a signal, then stop it; return the exit code."""
-    from rse_pf.extensions.fleet_page.page_process import run_beside_platform, run_page
-    from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
+    from rse_pf.local.side_process import run_beside_platform
 
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -531,19 +532,18 @@ async def _foreground(
         control=ControlOptions(elastic=True),
         lan=lan,
         metrics_port=settings.local.metrics_port,
-        recorder=make_platform_recorder(settings, folder),
+        recorder=_recorder(settings, folder),
     )
     try:
         async with platform:
             ready = True
             _show_welcome(platform, name)
-            page = run_page(folder, settings.local.page_port, _show_page)
             burst = run_beside_platform(
                 "lambda_pnp.local_front", folder, extras.burst_port or 0, folder / "burst.log",
                 lambda url: show(f"burst function      {url}"),
             )  # fmt: skip
             async with (
-                page if extras.page else nullcontext(),
+                _page(folder, settings.local.page_port) if extras.page else nullcontext(),
                 burst if extras.burst_port else nullcontext(),
             ):  # fmt: skip
                 await stopped.wait()
@@ -552,6 +552,21 @@ async def _foreground(
         show("", "stopped before it was ready", error=True)
         return 130
     return 0
+
+
+def _recorder(settings: PlatformSettings, folder: Path) -> PlatformRecorder | None:
+    """Return the recorder of the platform in *folder*; None if ``recording.folder`` is empty."""
+    if not settings.recording.folder:
+        return None
+    from rse_pf.extensions.recording.platform_recorder import FilePlatformRecorder
+
+    return FilePlatformRecorder(settings, folder)
+
+
+def _page(folder: Path, port: int) -> AbstractAsyncContextManager[None]:
+    from rse_pf.extensions.fleet_page.page_process import run_page
+
+    return run_page(folder, port, _show_page)
 
 
 def _show_welcome(platform: Any, name: str) -> None:
@@ -593,7 +608,7 @@ def _lan_lines(platform: Any, which: str) -> list[str]:
 
 def _show(event: Any) -> None:
     """Print *event* as a sentence with its time, unless it is in `_QUIET` or has no sentence."""
-    from rse_pf.extensions.fleet_page.feeds.events import EVENTS, event_sentence
+    from rse_pf.local.events import EVENTS, event_sentence
 
     if event["event"] in EVENTS and event["event"] not in _QUIET:
         show(f"{local_time(time.time())}  {event_sentence(event)}")

@@ -21,8 +21,7 @@ from rse_pf.audit.entry import parse_entry
 from rse_pf.audit.log import CONTROL_PLANE, audit_folder
 from rse_pf.audit.log import log_files as log_files_of
 from rse_pf.errors import UsageError
-from rse_pf.extensions.fleet_page.feeds.audit_log import PLATFORM
-from rse_pf.extensions.fleet_page.feeds.events import EVENTS, event_sentence, level_of
+from rse_pf.local.events import EVENTS, PLATFORM, event_sentence, level_of
 
 __all__ = [
     "ALL_LINES",

@@ -22,7 +22,6 @@ from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import UsageError
-from rse_pf.extensions.recording.writer import with_recordings
 
 if TYPE_CHECKING:
     from rse_pf.server.worker_context import ServerRecorder
@@ -124,6 +123,8 @@ def run_server(request: ServeRequest, settings: PlatformSettings) -> int:
         services["accept_weak_isolation"] = True
     chosen = settings.replace(serving=_given(request, _SETTINGS), services=services)
     if request.record is not None:
+        from rse_pf.extensions.recording.writer import with_recordings
+
         chosen = with_recordings(chosen, request.record)
     placement = ServerPlacement.read(request.settings, chosen, **_given(request, _PLACEMENT))
     server_id = f"server-{os.getpid()}" if request.server_id is None else request.server_id

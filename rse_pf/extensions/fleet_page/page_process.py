@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import http.client
 import json
-import os
-import sys
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -15,14 +12,13 @@ from typing import Any
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.extensions.fleet_page.server import ANNOUNCEMENT, page_url
+from rse_pf.local.side_process import run_beside_platform
 from rse_pf.local.state import control_token_file
 
-__all__ = ["new_address", "run_beside_platform", "run_page"]
+__all__ = ["new_address", "run_page"]
 
 # File in the platform's folder with the output of the page's process.
 _LOG = "fleet_page.log"
-# Time after which a process that does not exit on SIGTERM is killed, in seconds.
-_END_S = 3.0
 # Time limit of a request for a new key, in seconds.
 _TIMEOUT_S = 5.0
 
@@ -35,35 +31,6 @@ async def run_page(folder: Path, port: int, on_address: Callable[[str], None]) -
     """
     async with run_beside_platform("rse_pf.extensions.fleet_page", folder, port, folder / _LOG, on_address):
         yield
-
-
-@contextlib.asynccontextmanager
-async def run_beside_platform(
-    module: str, folder: Path, port: int, log_file: Path, on_address: Callable[[str], None]
-) -> AsyncIterator[None]:
-    """Run *module* as a process with the platform's *folder* inside the block; its output goes to *log_file*.
-
-    *on_address* is called with the address that the process prints.  The platform neither waits for the
-    process nor stops when it exits.
-    """
-    with log_file.open("ab") as log:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", module, str(folder), "--port", str(port),
-            "--parent", str(os.getpid()), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
-            stderr=log, start_new_session=True,
-        )  # fmt: skip
-    reader = asyncio.ensure_future(_read_address(process, on_address))
-    try:
-        yield
-    finally:
-        reader.cancel()
-        with contextlib.suppress(ProcessLookupError):
-            process.terminate()
-        try:
-            await asyncio.wait_for(process.wait(), _END_S)
-        except asyncio.TimeoutError:
-            process.kill()
-            await process.wait()
 
 
 def new_address(folder: Path, role: str) -> str:
@@ -97,10 +64,3 @@ def new_address(folder: Path, role: str) -> str:
         ) from error
     finally:
         connection.close()
-
-
-async def _read_address(process: asyncio.subprocess.Process, on_address: Callable[[str], None]) -> None:
-    assert process.stdout is not None
-    line = await process.stdout.readline()
-    with contextlib.suppress(ValueError, KeyError):
-        on_address(str(json.loads(line)["url"]))

@@ -13,12 +13,11 @@ from rse_pf.audit.entry import Entry, parse_entry
 from rse_pf.audit.log import OPERATOR, audit_folder
 from rse_pf.extensions.fleet_page.feeds.file_tail import FileTail
 from rse_pf.identity import RobotId
+from rse_pf.local.events import PLATFORM
 from rse_pf.terminal import printable
 
-__all__ = ["PLATFORM", "AuditRows", "audit_sentence"]
+__all__ = ["AuditRows", "audit_sentence"]
 
-PLATFORM = "platform."
-"""Prefix of the actions of entries that are events of the control plane."""
 # Largest number of entries that are shown after one reading; of more, the newest are shown.
 _MAX_ROWS = 200
 # Largest number of characters of a sentence.

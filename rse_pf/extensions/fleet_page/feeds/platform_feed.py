@@ -23,11 +23,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.extensions.fleet_page.feeds.audit_log import AuditRows
 from rse_pf.extensions.fleet_page.feeds.command_log import CommandLog
-from rse_pf.extensions.fleet_page.feeds.events import event_sentence, group_of
 from rse_pf.extensions.fleet_page.feeds.percentiles import LastMinute, buckets_of
 from rse_pf.extensions.fleet_page.feeds.sentences import waiting_for
 from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.local.events import event_sentence, group_of
 from rse_pf.local.processes import is_alive, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import platform_settings, read_state

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.extensions.fleet_page.feeds.events import event_sentence
+from rse_pf.local.events import event_sentence
 from rse_pf.server.live_map.map_server.process import warn_without_optimiser
 
 

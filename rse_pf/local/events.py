@@ -10,7 +10,10 @@ from typing import Any
 
 from rse_pf.identity import DEFAULT_TENANT
 
-__all__ = ["EVENTS", "event_sentence", "group_of", "level_of"]
+__all__ = ["EVENTS", "PLATFORM", "event_sentence", "group_of", "level_of"]
+
+PLATFORM = "platform."
+"""Beginning of the action of an entry of the audit log that is an event of the control plane."""
 
 # An event whose kind contains one of these words is in the group "trouble".
 _TROUBLE = (
