@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from system.local.test_control_plane import SETTINGS, SOON_S, News, platform
 
 from client_sdk import connect
 from rse_pf.extensions.fleet_page.feeds.live_feed import LiveFeed
 from rse_pf.extensions.fleet_page.hub import Hub
 from rse_pf.local.firewall import key_file, read_key
 from tests.kit.fake_map import keyframe_bytes
+from tests.system.local.test_control_plane import SETTINGS, SOON_S, News, platform
 
 pytestmark = pytest.mark.system
 
