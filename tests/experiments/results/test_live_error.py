@@ -12,11 +12,11 @@ import pytest
 from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.extensions.experiments.results.live_error import (
     LIVE_RECORDS,
-    TRUTH,
     live_figures,
     live_lines,
     read_live_drives,
 )
+from rse_pf.extensions.experiments.results.records import TRUTH
 from rse_pf.geometry import Array, Camera, exp_se3, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
 

@@ -12,10 +12,10 @@ import pytest
 
 from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.live_error import LIVE_RECORDS, TRUTH
+from rse_pf.extensions.experiments.results.live_error import LIVE_RECORDS
 from rse_pf.extensions.experiments.results.live_faults import fault_rows, live_fault_figures
 from rse_pf.extensions.experiments.results.log_replay import read_log
-from rse_pf.extensions.experiments.results.records import Records
+from rse_pf.extensions.experiments.results.records import TRUTH, Records
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.live_map.events import KeyframeAdded, MapServerChanged, encode_events

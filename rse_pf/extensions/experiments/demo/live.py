@@ -13,11 +13,10 @@ from typing import Any
 
 from client_sdk.frontend import TrackedFrame
 from client_sdk.live import LiveMapper
-from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
 from rse_pf.errors import RsePfError
-from rse_pf.extensions.experiments.results.live_error import LIVE_MAP, LIVE_RECORDS, TRUTH
+from rse_pf.extensions.experiments.results.live_error import LIVE_MAP, LIVE_RECORDS
 
 __all__ = ["LIVE_NAME", "LiveRecorder", "fetch_live_map", "show_live_map"]
 
@@ -58,11 +57,8 @@ class LiveRecorder:
             }
         )
 
-    async def finish(self, folder: Path, truth: Trajectory | None) -> None:
-        """Write the records, and *truth* if it is known, to *folder*.
-
-        This is called after the robot has left the map.
-        """
+    async def finish(self, folder: Path) -> None:
+        """Write the records to *folder*; this is called after the robot has left the map."""
         await self._listening
         self._lines.append({"event": "end", **self._mapper.report()["live"]})
         self._lines += [
@@ -76,8 +72,6 @@ class LiveRecorder:
         ]
         text = "".join(json.dumps(line) + "\n" for line in self._lines)
         await asyncio.to_thread((folder / LIVE_RECORDS).write_text, text, encoding="utf-8")
-        if truth is not None:
-            await asyncio.to_thread(write_trajectory, folder / TRUTH, truth)
 
     async def _listen(self) -> None:
         async for correction in self._mapper.corrections():

@@ -126,6 +126,11 @@ class Disturbance:
         self._watching: asyncio.Task[None] | None = None
         self._acting: asyncio.Task[None] | None = None
 
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The fault and its seed, for the parameters of the run."""
+        return {"fault": self._fault.name, "fault_seed": self._fault.seed}
+
     def watch(self) -> None:
         """Start the task that records the changes of the map's lease."""
         self._watching = asyncio.create_task(self._watch())

@@ -36,7 +36,7 @@ from rse_pf.extensions.experiments.child_process import ChildFailed, ChildReady,
 from rse_pf.extensions.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
 from rse_pf.extensions.experiments.demo.live import LIVE_NAME, LiveRecorder
 from rse_pf.extensions.experiments.demo.merge import MAP_FILE
-from rse_pf.extensions.experiments.results.records import CommandRecord
+from rse_pf.extensions.experiments.results.records import TRUTH, CommandRecord
 
 if TYPE_CHECKING:
     from client_sdk.datasets import CameraChoice, Dataset
@@ -277,9 +277,9 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 pipe.send(FrameDone(row + 1))
             took_s = time.monotonic() - first_s
         if recorder is not None:
-            await recorder.finish(spec.folder, truth)
+            await recorder.finish(spec.folder)
         trajectory = mapper.trajectory
-        uploaded = await asyncio.to_thread(_write, spec.folder, mapper, trajectory, collector)
+        uploaded = await asyncio.to_thread(_write, spec.folder, mapper, trajectory, truth, collector)
         pipe.send(
             RobotFinished(
                 frames=mapper.frames,
@@ -397,9 +397,13 @@ def _collector(spec: RobotSpec, token: Callable[[], str]) -> KeyframeCollector |
 
 
 def _write(
-    folder: Path, mapper: Mapper | LiveMapper, trajectory: Trajectory, collector: KeyframeCollector | None
+    folder: Path,
+    mapper: Mapper | LiveMapper,
+    trajectory: Trajectory,
+    truth: Trajectory | None,
+    collector: KeyframeCollector | None,
 ) -> int:
-    """Write cloud and trajectory of the robot; with *collector* also write and upload its map.
+    """Write cloud, trajectory and truth of the robot; with *collector* also write and upload its map.
 
     Return the number of keyframes that were uploaded, 0 without *collector*.
     """
@@ -411,6 +415,8 @@ def _write(
         is_metric=_is_metric(mapper),
         T_body_camera=mapper.T_body_camera,
     )
+    if truth is not None:
+        write_trajectory(folder / TRUTH, truth)
     if collector is None:
         return 0
     data = collector.encoded_map(points, colours)

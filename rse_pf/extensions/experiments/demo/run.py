@@ -8,9 +8,8 @@ it returns.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -41,6 +40,7 @@ from rse_pf.extensions.experiments.demo.robot import (
     RobotSpec,
     run_robot,
 )
+from rse_pf.extensions.experiments.harness import Harness
 from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.extensions.experiments.results.live_error import (
     LIVE_MAP,
@@ -48,16 +48,14 @@ from rse_pf.extensions.experiments.results.live_error import (
     read_live_drives,
     read_live_map,
 )
-from rse_pf.extensions.experiments.results.records import COMMANDS, EVENTS, SAMPLES, EventLog, write_commands
+from rse_pf.extensions.experiments.results.records import COMMANDS, robot_names, write_commands
 from rse_pf.extensions.experiments.results.result_folder import (
     RUN_FILES,
     environment,
     fresh_folder,
     load_average,
-    remove_keys,
     write_json,
 )
-from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
 from rse_pf.geometry import Array
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.maps.format import MapVersion
@@ -90,8 +88,12 @@ class _Robot:
     finished: RobotFinished | None = None
 
 
-def run_demo(options: DemoOptions, settings: PlatformSettings, fault: LiveFault | None = None) -> int:
+def run_demo(
+    options: DemoOptions, settings: PlatformSettings, fault: LiveFault | None = None, *, kind: str = "demo"
+) -> int:
     """Run the demo, inject *fault* if given, write results to ``options.out``, and print the main figures.
+
+    *kind* names the experiment in the records.
 
     Return 1 if a command got no final answer, or if more than half of the frames got no pose; else 0.
     """
@@ -113,8 +115,7 @@ def run_demo(options: DemoOptions, settings: PlatformSettings, fault: LiveFault 
     chosen = settings.replace(pnp={"engine": options.engine})
     if fault is not None:
         chosen = fault.settings(chosen)
-    with (folder / EVENTS).open("w", encoding="utf-8") as file:
-        report = asyncio.run(_run(options, chosen, folder, EventLog(file), fault))
+    report = asyncio.run(_run(options, chosen, folder, fault, kind))
     show_page(closing_lines(report, folder, options.shown))
     return 1 if is_lost(report) else 0
 
@@ -123,81 +124,60 @@ async def _run(
     options: DemoOptions,
     settings: PlatformSettings,
     folder: Path,
-    events: EventLog,
     fault: LiveFault | None,
+    kind: str,
 ) -> dict[str, Any]:
     before = environment(settings)
-    origin = time.monotonic()
-
-    def now() -> float:
-        return time.monotonic() - origin
-
     with _progress_bars(options.quiet) as screen:
         screen.print("starting the platform: Envoy and two backend servers")
         async with AsyncExitStack() as stack:
             if fault is not None:
                 stack.enter_context(fault.environment(folder / "failing-store"))
-            platform = await stack.enter_async_context(
-                LocalPlatform(
-                    settings,
-                    port=0,
-                    state=folder / "platform",
-                    name="demo",
-                    on_event=lambda event: events.copy(event, now()),
-                    data=options.merge or options.live,
-                    recorder=make_platform_recorder(settings, folder / "platform"),
-                )
+            harness = await stack.enter_async_context(
+                Harness(folder, settings, data=options.merge or options.live, elastic=False)
             )
+            platform = harness.platform
             disturbance = None
             if fault is not None:
-                disturbance = await stack.enter_async_context(
-                    fault.disturb(
-                        platform, folder, lambda action, **more: events.write(now(), action, **more)
-                    )
-                )
+                disturbance = await stack.enter_async_context(fault.disturb(platform, folder, harness.log))
             pids = ", ".join(f"{server.name} {server.pid}" for server in platform.servers)
             screen.print(f"running at {platform.url}: {pids}")
             screen.print("kill -9 one of these processes: the robots continue on the other server")
-            samples = asyncio.create_task(_sample(platform, folder / SAMPLES, now))
             robots = [
                 _start(
                     RobotSpec(
-                        name=_name(number),
+                        name=name,
                         number=number,
                         url=platform.url if disturbance is None else disturbance.url_of(number),
-                        folder=folder / _name(number),
+                        folder=folder / name,
                         options=options,
                         session=settings.session,
                         has_offload=fault is not None and fault.has_offload,
                     ),
                     screen,
                 )
-                for number in range(options.robots)
+                for number, name in enumerate(robot_names(options.robots))
             ]
             try:
-                await _follow(robots, platform, screen, events, now, disturbance)
+                await _follow(robots, harness, screen, kind, disturbance)
                 if disturbance is not None:
                     await disturbance.finish()
             finally:
-                samples.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await samples
                 _end(robots)
             finished = [robot.finished for robot in robots if robot.finished is not None]
             merged = None
             if options.merge:
                 screen.print("merging the maps")
                 merged = await asyncio.to_thread(_merge, settings, folder, finished, platform, screen)
-                events.write(now(), "merged", joined=merged["joined"])
+                harness.log("merged", joined=merged["joined"])
             if options.live:
                 token = platform.issue_token("operator")
                 if fault is not None:
                     shown = await show_live_map(platform.url, token, settings.session)
-                    events.write(now(), "final-map", **shown)
+                    harness.log("final-map", **shown)
                 screen.print("publishing the live map")
                 why = await fetch_live_map(platform.url, token, folder, settings.session)
-                events.write(now(), "published", trouble=why)
-    remove_keys(folder / "platform")
+                harness.log("published", trouble=why)
     screen.print("drawing the maps")
     return _write_results(options, folder, finished, before, merged)
 
@@ -212,27 +192,36 @@ def _start(spec: RobotSpec, screen: Progress) -> _Robot:
 
 async def _follow(
     robots: list[_Robot],
-    platform: LocalPlatform,
+    harness: Harness,
     screen: Progress,
-    events: EventLog,
-    now: Callable[[], float],
+    kind: str,
     disturbance: Disturbance | None,
 ) -> None:
     """Wait until all robots are ready, start them at the same time, and wait until all have finished.
 
-    The fault of *disturbance* is injected while they drive.
+    The fault of *disturbance* is injected while they drive.  The parameters of the run are recorded as those
+    of the experiment *kind*.
     """
+    options, platform = robots[0].spec.options, harness.platform
     inboxes = [_messages(robot.pipe) for robot in robots]
     ready = await asyncio.gather(
         *(_wait_for(ChildReady, *pair, platform, screen) for pair in zip(robots, inboxes, strict=True))
     )
-    start_after_s = _LIVE_START_S if robots[0].spec.options.live else _START_S
+    harness.log(
+        "experiment",
+        kind=kind,
+        robots=len(robots),
+        fps=options.rate_hz,
+        frames={robot.spec.name: message.frames for robot, message in zip(robots, ready, strict=True)},
+        **({} if disturbance is None else disturbance.parameters),
+    )
+    start_after_s = _LIVE_START_S if options.live else _START_S
     began = time.monotonic() + start_after_s
-    events.write(now(), "robots-start", robots=len(robots), after_s=start_after_s)
+    harness.log("robots-start", robots=len(robots), after_s=start_after_s)
     screen.print("the robots start")
     if disturbance is not None:
         frames = max(message.frames for message in ready)
-        disturbance.begin(start_after_s, frames / robots[0].spec.options.rate_hz)
+        disturbance.begin(start_after_s, frames / options.rate_hz)
     for robot, message in zip(robots, ready, strict=True):
         screen.reset(robot.bar, description=f"{robot.spec.name}  mapping", total=message.frames)
         robot.pipe.send(began)
@@ -241,7 +230,7 @@ async def _follow(
     )
     for robot, figures in zip(robots, finished, strict=True):
         robot.finished = figures
-    events.write(now(), "robots-end")
+    harness.log("robots-end")
 
 
 async def _wait_for(
@@ -287,21 +276,6 @@ async def _messages(pipe: Connection) -> AsyncIterator[Any]:
         loop.remove_reader(number)
 
 
-async def _sample(platform: LocalPlatform, path: Path, now: Callable[[], float]) -> None:
-    """Write the status of the servers to the CSV file *path* twice per second, until cancelled."""
-    with path.open("w", encoding="utf-8") as file:
-        file.write("time,server,pid,robots,requests,queue,in_flight,cpu_s\n")
-        while True:
-            for status in await platform.status():
-                row = [
-                    status.get(name, "")
-                    for name in ("server", "pid", "robots", "requests", "queue", "in_flight", "cpu_s")
-                ]
-                file.write(f"{now():.3f}," + ",".join(str(value) for value in row) + "\n")
-            file.flush()
-            await asyncio.sleep(0.5)
-
-
 def _end(robots: list[_Robot]) -> None:
     for robot in robots:
         end_process(robot.process, robot.pipe, _EXIT_TIMEOUT_S if robot.finished else 0.0)
@@ -315,7 +289,7 @@ def _merge(
     screen: Progress,
 ) -> dict[str, Any]:
     """Merge the maps that the robots have committed, on the platform; return the figures for the report."""
-    names = [_name(number) for number in range(len(finished))]
+    names = robot_names(len(finished))
     url, token = platform.url, platform.issue_token("operator")
     section = write_merged(
         folder,
@@ -326,10 +300,6 @@ def _merge(
     )
     section["keyframes_uploaded"] = sum(robot.stats["keyframes_uploaded"] for robot in finished)
     return section
-
-
-def _name(number: int) -> str:
-    return f"robot-{number + 1}"
 
 
 def _write_results(
@@ -347,11 +317,14 @@ def _write_results(
     report = make_report(finished, commands, asked, before, load_average())
     if merged is not None:
         report["merged"] = merged
-    checks = {_name(number): robot.check for number, robot in enumerate(finished) if robot.check is not None}
+    names = robot_names(len(finished))
+    checks = {
+        name: robot.check for name, robot in zip(names, finished, strict=True) if robot.check is not None
+    }
     if checks:
         report["checks"] = checks
     if options.live:
-        drives = read_live_drives(folder, [_name(number) for number in range(len(finished))])
+        drives = read_live_drives(folder, names)
         live_map = read_live_map(folder)
         report["live"] = live_figures(drives, live_map)
         if live_map is not None:
@@ -361,8 +334,8 @@ def _write_results(
     write_json(folder / "report.json", report)
     (folder / "report.md").write_text(demo_page(report), encoding="utf-8")
     paths = [
-        RobotPath(name=_name(number), T_world_camera=robot.trajectory.T_world_camera)
-        for number, robot in enumerate(finished)
+        RobotPath(name=name, T_world_camera=robot.trajectory.T_world_camera)
+        for name, robot in zip(names, finished, strict=True)
     ]
     clouds = [read_ply(folder / path.name / "map.ply") for path in paths]
     for path, (points, colours), robot in zip(paths, clouds, finished, strict=True):

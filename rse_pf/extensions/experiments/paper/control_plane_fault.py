@@ -19,9 +19,9 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
+from rse_pf.extensions.experiments.harness import generator_event, policy_parameters
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.load.swarm import Swarm
-from rse_pf.extensions.experiments.paper.harness import generator_event, policy_parameters
 from rse_pf.extensions.experiments.results.records import (
     COMMANDS,
     EVENTS,

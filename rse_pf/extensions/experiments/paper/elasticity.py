@@ -18,8 +18,8 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
+from rse_pf.extensions.experiments.harness import Harness, generator_of
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
-from rse_pf.extensions.experiments.paper.harness import Harness, generator_of
 from rse_pf.extensions.experiments.plots.figures import draw_elasticity, require_matplotlib
 from rse_pf.extensions.experiments.results.bars import Bars
 from rse_pf.extensions.experiments.results.markdown import (

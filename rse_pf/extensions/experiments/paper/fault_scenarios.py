@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.extensions.experiments.paper.harness import Harness
+from rse_pf.extensions.experiments.harness import Harness
 
 __all__ = ["SCENARIOS", "Scenario"]
 

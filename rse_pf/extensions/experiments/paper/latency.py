@@ -17,8 +17,8 @@ import numpy as np
 
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.experiments.faults.network_emulator import profile_named
+from rse_pf.extensions.experiments.harness import Harness, generator_of
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
-from rse_pf.extensions.experiments.paper.harness import Harness, generator_of
 from rse_pf.extensions.experiments.plots.figures import draw_latency, require_matplotlib
 from rse_pf.extensions.experiments.results.bars import Bars
 from rse_pf.extensions.experiments.results.markdown import about_run, number, page, slashed, table, three

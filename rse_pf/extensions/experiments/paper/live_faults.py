@@ -14,12 +14,12 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.experiments.demo.live_faults import LIVE_FAULTS, LiveFault
 from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
-from rse_pf.extensions.experiments.paper.mapping import complete_records, frames_of
+from rse_pf.extensions.experiments.paper.mapping import asked_of
 from rse_pf.extensions.experiments.plots.figures import draw_live, require_matplotlib
 from rse_pf.extensions.experiments.results.live_error import read_live_drives, read_live_map
 from rse_pf.extensions.experiments.results.live_faults import fault_rows, live_fault_figures
 from rse_pf.extensions.experiments.results.markdown import about_run, number, page, table
-from rse_pf.extensions.experiments.results.records import read_records
+from rse_pf.extensions.experiments.results.records import read_records, robot_names
 from rse_pf.extensions.experiments.results.result_folder import (
     RUN_FILES,
     finish_report,
@@ -58,14 +58,7 @@ def run_live_faults(
             show(*_lines(runs))
     report = {
         "experiment": "live",
-        "asked": {
-            "robots": options.robots,
-            "fps": options.rate_hz,
-            "data": options.data and options.data.name,
-            "frames": options.frame_count,
-            "seed": options.seed,
-            "repeat": repeat,
-        },
+        "asked": {**asked_of(options), "repeat": repeat},
         "runs": runs,
     }
     finish_report(folder, report, live_faults_page, settings, load_before)
@@ -77,14 +70,10 @@ def run_live_faults(
 
 def run_live_fault(options: DemoOptions, settings: PlatformSettings, fault: LiveFault) -> dict[str, Any]:
     """Run the demo with one fault, write records and image to ``options.out``, and return the figures."""
-    run_demo(options, settings, fault)
+    run_demo(options, settings, fault, kind="live-fault")
     folder = options.out.resolve()
-    frames = frames_of(options)
-    complete_records(
-        options, settings, folder, frames, kind="live-fault", fault=fault.name, fault_seed=fault.seed
-    )
     figures = live_fault_figures(read_records(folder))
-    drives = read_live_drives(folder, list(frames))
+    drives = read_live_drives(folder, robot_names(options.robots))
     draw_live(folder / _FIGURE, drives, read_live_map(folder), figures["live"])
     return figures
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
-from rse_pf.extensions.experiments.paper.mapping import complete_records, frames_of
+from rse_pf.extensions.experiments.paper.mapping import asked_of
 from rse_pf.extensions.experiments.plots.figures import draw_live, require_matplotlib
 from rse_pf.extensions.experiments.results.live_error import (
     live_figures,
@@ -21,7 +21,7 @@ from rse_pf.extensions.experiments.results.live_error import (
     read_live_map,
 )
 from rse_pf.extensions.experiments.results.markdown import about_run, page, three
-from rse_pf.extensions.experiments.results.records import Records, parameters_of, read_records
+from rse_pf.extensions.experiments.results.records import Records, parameters_of, read_records, robot_names
 from rse_pf.extensions.experiments.results.result_folder import finish_report, load_average
 from rse_pf.extensions.experiments.results.summary import summarise
 from rse_pf.terminal import show_page
@@ -38,21 +38,11 @@ def run_live(options: DemoOptions, settings: PlatformSettings) -> int:
     """
     require_matplotlib()
     load_before = load_average()
-    code = run_demo(options, settings)
+    code = run_demo(options, settings, kind="live")
     folder = options.out.resolve()
-    complete_records(options, settings, folder, frames_of(options), kind="live")
     records = read_records(folder)
-    asked = {
-        "out": options.out.name,
-        "robots": options.robots,
-        "fps": options.rate_hz,
-        "data": options.data and options.data.name,
-        "frames": options.frame_count,
-        "codec": options.codec,
-        "seed": options.seed,
-    }
-    report = {"experiment": "live", "asked": asked, **live_experiment_figures(records)}
-    drives = read_live_drives(folder, _names(records))
+    report = {"experiment": "live", "asked": asked_of(options), **live_experiment_figures(records)}
+    drives = read_live_drives(folder, robot_names(options.robots))
     draw_live(folder / FIGURE, drives, read_live_map(folder), report["live"])
     show_page(finish_report(folder, report, live_page, settings, load_before))
     return code
@@ -66,7 +56,7 @@ def live_experiment_figures(records: Records) -> dict[str, Any]:
     """
     summary = summarise(records.commands)
     names = ("commands", "failures_by_code", "payload_bytes", "round_trip_ms", "compute_ms")
-    drives = read_live_drives(records.folder, _names(records))
+    drives = read_live_drives(records.folder, robot_names(int(parameters_of(records)["robots"])))
     return {
         **{name: summary[name] for name in names},
         "live": live_figures(drives, read_live_map(records.folder)),
@@ -84,7 +74,3 @@ def live_page(report: Mapping[str, Any]) -> str:
         "robots after one alignment to the truth, and only where all have joined.",
         about_run(report),
     )
-
-
-def _names(records: Records) -> list[str]:
-    return [f"robot-{row + 1}" for row in range(int(parameters_of(records)["robots"]))]

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
+from rse_pf.extensions.experiments.harness import Harness, generator_of
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.extensions.experiments.paper.control_plane_fault import run_control_plane_fault
 from rse_pf.extensions.experiments.paper.elasticity import crashes, slowest_replacement_s
 from rse_pf.extensions.experiments.paper.fault_scenarios import SCENARIOS
-from rse_pf.extensions.experiments.paper.harness import Harness, generator_of
 from rse_pf.extensions.experiments.plots.figures import draw_robustness, require_matplotlib
 from rse_pf.extensions.experiments.results.bars import with_bars
 from rse_pf.extensions.experiments.results.markdown import about_run, failures, number, page, slashed, table

@@ -19,6 +19,7 @@ from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.extensions.experiments.results.map_error import move_frames
 from rse_pf.extensions.experiments.results.markdown import number, table
+from rse_pf.extensions.experiments.results.records import TRUTH
 from rse_pf.extensions.experiments.results.trajectory_error import align, match_truth
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, decode_map
@@ -26,7 +27,6 @@ from rse_pf.maps.format import MapVersion, decode_map
 __all__ = [
     "LIVE_MAP",
     "LIVE_RECORDS",
-    "TRUTH",
     "LiveDrive",
     "alignment_errors",
     "correction_delays_ms",
@@ -43,9 +43,6 @@ LIVE_RECORDS = "live.jsonl"
 """Name of the file with a robot's records, in the folder of the robot."""
 LIVE_MAP = "live.rsemap"
 """Name of the file with the map that was published at the end, in the folder of the run."""
-TRUTH = "truth.txt"
-"""Name of the file with a robot's true trajectory, in the folder of the robot."""
-
 
 # Scale in the records of a robot that measures lengths in an unknown unit.
 _UP_TO_SCALE = "up to scale"

@@ -21,7 +21,13 @@ from rse_pf.extensions.experiments.results.live_error import (
 )
 from rse_pf.extensions.experiments.results.log_replay import LoggedMap, read_log
 from rse_pf.extensions.experiments.results.markdown import number, slashed
-from rse_pf.extensions.experiments.results.records import CommandRecord, Event, Records, parameters_of
+from rse_pf.extensions.experiments.results.records import (
+    CommandRecord,
+    Event,
+    Records,
+    parameters_of,
+    robot_names,
+)
 from rse_pf.extensions.experiments.results.summary import summarise
 
 __all__ = ["LIVE_FAULT_BARS", "fault_rows", "live_fault_figures"]
@@ -55,8 +61,7 @@ def live_fault_figures(records: Records) -> dict[str, Any]:
     """
     parameters = parameters_of(records)
     fault = str(parameters["fault"])
-    names = [f"robot-{row + 1}" for row in range(int(parameters["robots"]))]
-    drives = read_live_drives(records.folder, names)
+    drives = read_live_drives(records.folder, robot_names(int(parameters["robots"])))
     final: Mapping[str, Any] = next((event for event in records.events if event["action"] == "final-map"), {})
     logged = read_log(records.folder / "platform" / "objects", int(final.get("position", 0)))
     started = next(

@@ -24,6 +24,7 @@ __all__ = [
     "COMMANDS",
     "EVENTS",
     "SAMPLES",
+    "TRUTH",
     "CommandRecord",
     "Event",
     "EventLog",
@@ -34,6 +35,7 @@ __all__ = [
     "read_commands",
     "read_records",
     "read_samples",
+    "robot_names",
     "run_sample",
     "sample_from_document",
     "write_commands",
@@ -45,6 +47,8 @@ EVENTS = "events.jsonl"
 """Name of the file with the events of a run."""
 SAMPLES = "samples.csv"
 """Name of the file with the samples of the monitor during a run."""
+TRUTH = "truth.txt"
+"""Name of the file with a robot's true trajectory, in the folder of the robot."""
 # Exceptions that a missing or malformed file of records raises.
 _MALFORMED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _HINT = "name the folder of a run"
@@ -180,8 +184,13 @@ def parameters_of(records: Records) -> dict[str, Any]:
         if event["action"] == "experiment":
             return event_details(event)
     raise UsageError(
-        "the events do not say which experiment this was", hint=f"check the first line of {EVENTS}"
+        "the events do not say which experiment this was", hint=f"check the event experiment in {EVENTS}"
     )
+
+
+def robot_names(count: int) -> list[str]:
+    """Return the names of the robots of a run, which are those of their folders."""
+    return [f"robot-{number}" for number in range(1, count + 1)]
 
 
 def read_commands(path: Path) -> list[CommandRecord]:

@@ -53,8 +53,9 @@ class Harness:
         self,
         folder: Path,
         settings: PlatformSettings,
-        parameters: Mapping[str, Any],
+        parameters: Mapping[str, Any] | None = None,
         *,
+        data: bool = False,
         elastic: bool = True,
         compress: float = 1.0,
         rebalance: bool = True,
@@ -65,7 +66,8 @@ class Harness:
         Args:
             folder: Folder of the records; it exists and is empty.
             settings: Settings of the platform.
-            parameters: Parameters of this run, for its first event.
+            parameters: Parameters of this run, for its first event; None if the caller records them later.
+            data: Whether the platform has data servers.
             elastic: Whether the monitor and the scale modifier run, which add and remove servers.
             compress: Factor by which the periods of the scaling policy are divided.
             rebalance: Whether robots migrate from servers with many robots to others.
@@ -77,7 +79,10 @@ class Harness:
         self.events: list[dict[str, Any]] = []
         self.samples: list[MonitorSample] = []
         self.link: Any = None
-        self._parameters = {**parameters, **policy_parameters(settings, compress)}
+        self._parameters = (
+            None if parameters is None else {**parameters, **policy_parameters(settings, compress)}
+        )
+        self._data = data
         self._servers = servers
         self._control = ControlOptions(
             elastic=elastic, compress=compress, rebalance=rebalance, on_sample=self._on_sample
@@ -96,13 +101,15 @@ class Harness:
             for name in (EVENTS, SAMPLES)
         )
         self._event_log, self._sample_log = EventLog(events), SampleLog(samples)
-        self.log("experiment", **self._parameters, origin_s=self.origin_s)
+        if self._parameters is not None:
+            self.log("experiment", **self._parameters, origin_s=self.origin_s)
         platform = LocalPlatform(
             self.settings,
             state=self.folder / "platform",
             port=0,
             name="experiment",
             on_event=lambda event: self.log(str(event["event"]), **event_details(event)),
+            data=self._data,
             servers=self._servers,
             control=self._control,
             recorder=make_platform_recorder(self.settings, self.folder / "platform"),
