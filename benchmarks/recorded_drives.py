@@ -18,7 +18,7 @@ from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 
@@ -122,38 +122,9 @@ def track(tracker: Tracker | MonocularTracker, frame: Frame) -> TrackedFrame:
     return step
 
 
-def frame_poses(run: Run, T_world_keyframe: Array) -> Array:
-    """Return every frame's pose after its keyframes moved to ``(k, 4, 4)``.
-
-    A frame between two keyframes takes part of the correction of each, by its place between them.
-    """
-    old = np.array([keyframe.T_world_camera for keyframe in run.version.keyframes])
-    steps = np.array([inverse(view) for view in old]) @ run.T_world_camera[:, None]
-    moved = []
-    counts = np.bincount(run.keyframe_of_frame, minlength=len(old))
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    for place, k in enumerate(run.keyframe_of_frame):
-        first = T_world_keyframe[k] @ steps[place, k]
-        if k + 1 < len(old):
-            second = T_world_keyframe[k + 1] @ steps[place, k + 1]
-            share = (place - starts[k]) / counts[k]
-            moved.append(_between(first, second, share))
-        else:
-            moved.append(first)
-    return np.array(moved)
-
-
 def cloud_of(dataset: Dataset, rows: Sequence[int], T_world_camera: Array, voxel_m: float = 0.01) -> PointMap:
     """Return the cloud of *rows* seen from *T_world_camera*."""
     cloud = PointMap(MapOptions(voxel_m=voxel_m))
     for row, T in zip(rows, T_world_camera, strict=True):
         cloud.add(dataset.read(row), T)
     return cloud
-
-
-def _between(first: Array, second: Array, share: float) -> Array:
-    """Return a pose between two that are close: positions linearly, rotations by projection."""
-    mean = (1.0 - share) * first + share * second
-    U, _, Vt = np.linalg.svd(mean[:3, :3])
-    mean[:3, :3] = U @ Vt
-    return mean

@@ -22,9 +22,11 @@ import numpy as np
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import percentile, spread
-from benchmarks.recorded_drives import Run, drive, frame_poses, red_kitchen, truth_of
+from benchmarks.recorded_drives import Run, drive, red_kitchen, truth_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
+from client_sdk.trajectory import Trajectory
+from rse_pf.extensions.experiments.results.map_error import move_frames
 from rse_pf.extensions.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured, MapStarted
@@ -82,7 +84,7 @@ class Played:
     def final_cm(self, runs: Mapping[str, Run], truth: Mapping[str, Array]) -> float:
         """Return the ATE, cm, of all frames with the poses of the keyframes at the end."""
         poses = [
-            frame_poses(run, np.array([self.live_map.pose(i) for i in self.ids[name]]))
+            final_poses(run, np.array([self.live_map.pose(i) for i in self.ids[name]]))
             for name, run in runs.items()
         ]
         return 100.0 * ate_m(np.concatenate(poses), np.concatenate([truth[name] for name in runs]))
@@ -90,6 +92,15 @@ class Played:
     def joined_at(self) -> dict[str, int]:
         """Return the first frame of each robot, in its own count, of which it knew the pose in the map."""
         return {name: min(frames) for name, frames in self.given.items() if frames}
+
+
+def final_poses(run: Run, T_world_keyframe: Array) -> Array:
+    """Return the pose ``(n, 4, 4)`` of each frame of *run* after its keyframes moved to ``(k, 4, 4)``."""
+    keyframes = run.version.keyframes
+    stamps_s = np.array([keyframe.timestamp_s for keyframe in keyframes])
+    before = np.array([keyframe.T_world_camera for keyframe in keyframes])
+    path = Trajectory(np.array(run.stamps_s), run.T_world_camera)
+    return move_frames(path, stamps_s, before, T_world_keyframe).T_world_camera
 
 
 def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:

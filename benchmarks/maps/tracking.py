@@ -35,7 +35,7 @@ from client_sdk.simulator.world import make_world
 from client_sdk.tracking.segment_join import Join
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.results.trajectory_error import ate_m, motion_errors
+from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse
 
 _TURNING = "tum_fr1_rpy_start"
@@ -134,16 +134,13 @@ def row_of(drive: Drive) -> dict[str, Any]:
     ]
     stamps_s = np.array([s for s, pose in zip(drive.stamps_s, poses, strict=True) if pose is not None])
     estimate = np.array([pose for pose in poses if pose is not None])
-    true_poses = drive.truth.at(stamps_s)
-    metres, degrees = motion_errors(stamps_s, estimate, true_poses)
+    errors = accuracy(Trajectory(stamps_s, estimate), drive.truth)
     return {
         "frames": len(tracked),
         "lost": len(lost),
         "lost_frames": lost,
-        "ate_cm": 100 * ate_m(estimate, true_poses),
-        "rpe_deg": float(np.sqrt(np.mean(degrees**2))),
-        "rpe_max_deg": float(degrees.max(initial=0.0)),
-        "rpe_cm": float(100 * np.sqrt(np.mean(metres**2))),
+        **errors.figures(),
+        "rpe_max_deg": errors.rpe_max_deg,
         "keyframes": tracker.keyframes,
         "segments": 1 + max(result.segment for result in tracked),
         "joins": len(tracker.joins),

@@ -210,9 +210,7 @@ def _figures_of(errors: Accuracy | None) -> dict[str, float | int | None]:
         names = ("ate_cm", "rpe_cm", "rpe_deg", "rpe_max_deg", "scale")
         return {**dict.fromkeys(names), "poses_with_truth": 0}
     return {
-        "ate_cm": 100 * errors.ate_m,
-        "rpe_cm": None if errors.rpe_m is None else 100 * errors.rpe_m,
-        "rpe_deg": errors.rpe_deg,
+        **errors.figures(),
         "rpe_max_deg": errors.rpe_max_deg,
         "scale": errors.scale,
         "poses_with_truth": errors.poses,

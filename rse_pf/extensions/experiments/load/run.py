@@ -27,7 +27,6 @@ from rse_pf.extensions.experiments.load.swarm_process import ResultRows
 from rse_pf.extensions.experiments.results.records import (
     COMMANDS,
     EVENTS,
-    CommandRecord,
     EventLog,
     write_commands,
 )
@@ -37,7 +36,12 @@ from rse_pf.extensions.experiments.results.result_folder import (
     load_average,
     write_json,
 )
-from rse_pf.extensions.experiments.results.summary import percent_answered, percentiles, summarise
+from rse_pf.extensions.experiments.results.summary import (
+    frame_rates,
+    percent_answered,
+    percentiles,
+    summarise,
+)
 from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.terminal import show, show_page
@@ -108,7 +112,7 @@ def report_of(scenario: LoadScenario, result: SwarmResult, before: Mapping[str, 
         "answered_percent": percent_answered(result.commands) or 0.0,
         "answered_in_time_percent": percent_answered(result.commands, FAST_MS) or 0.0,
         "in_time_ms": FAST_MS,
-        "fps_per_robot": percentiles(_frame_rates(result.commands, scenario.fps)),
+        "fps_per_robot": percentiles(frame_rates(result.commands)),
         "wrong_poses": result.wrong_poses,
         "twice": result.duplicates,
         "reconnects": result.reconnects,
@@ -202,15 +206,6 @@ def _round_trips_ms(rows: ResultRows) -> np.ndarray[Any, np.dtype[np.float64]]:
     answered = np.array([code == "ok" for code in rows.codes], dtype=np.bool_)
     trips: np.ndarray[Any, np.dtype[np.float64]] = 1e3 * (table[answered, 4] - table[answered, 2])
     return trips
-
-
-def _frame_rates(commands: list[CommandRecord], fps: float) -> list[float]:
-    planned: dict[str, list[float]] = {}
-    answered: dict[str, int] = {}
-    for command in commands:
-        planned.setdefault(command.robot, []).append(command.planned)
-        answered[command.robot] = answered.get(command.robot, 0) + (command.code == "ok")
-    return [answered[robot] / (max(times) - min(times) + 1.0 / fps) for robot, times in planned.items()]
 
 
 def table_of(report: Mapping[str, Any], folder: Path) -> str:

@@ -7,7 +7,6 @@ the profile, and the delay that the load generator itself added.
 from __future__ import annotations
 
 import asyncio
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,6 +32,7 @@ from rse_pf.extensions.experiments.results.result_folder import (
 from rse_pf.extensions.experiments.results.summary import (
     PAPER,
     ROUND_TRIP_PARTS,
+    frame_rates,
     percent_answered,
     summary_of,
 )
@@ -186,20 +186,7 @@ def _difference(value: float | None, other: float | None) -> float | None:
 
 
 def _frame_rates(commands: Sequence[CommandRecord]) -> dict[str, float | None]:
-    """Return the mean and the least number of answers per second of a robot while it sent commands.
-
-    Both are None if no robot sent two commands.
-    """
-    by_robot: dict[str, list[CommandRecord]] = defaultdict(list)
-    for command in commands:
-        by_robot[command.robot].append(command)
-    rates = []
-    for own in by_robot.values():
-        planned = [record.planned for record in own]
-        sending_s = max(planned) - min(planned)
-        if sending_s > 0:  # n frames span n - 1 intervals
-            answered = sum(record.code == "ok" for record in own)
-            rates.append(answered * (len(own) - 1) / len(own) / sending_s)
+    rates = frame_rates(commands)
     if not rates:
         return {"mean": None, "least": None}
     return {"mean": round(float(np.mean(rates)), 3), "least": round(min(rates), 3)}

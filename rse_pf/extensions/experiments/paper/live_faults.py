@@ -16,9 +16,10 @@ from rse_pf.extensions.experiments.demo.live_faults import LIVE_FAULTS, LiveFaul
 from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.extensions.experiments.paper.mapping import asked_of
 from rse_pf.extensions.experiments.plots.figures import draw_live, require_matplotlib
+from rse_pf.extensions.experiments.results.bars import bars_blocks
 from rse_pf.extensions.experiments.results.live_error import read_live_drives, read_live_map
 from rse_pf.extensions.experiments.results.live_faults import fault_rows, live_fault_figures
-from rse_pf.extensions.experiments.results.markdown import about_run, number, page, table
+from rse_pf.extensions.experiments.results.markdown import about_run, page, table
 from rse_pf.extensions.experiments.results.records import read_records, robot_names
 from rse_pf.extensions.experiments.results.result_folder import (
     RUN_FILES,
@@ -82,17 +83,12 @@ def live_faults_page(report: Mapping[str, Any]) -> str:
     """Return the text of ``report.md``: rows of all runs, the targets and whether they were met, images."""
     runs: Mapping[str, Mapping[str, Any]] = report["runs"]
     head, *rows = fault_rows(runs)
-    bars = [
-        [name, figure, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
-        for name, run in runs.items()
-        for figure, bar in run["bars"].items()
-    ]
+    met, bars = bars_blocks(runs)
     return page(
         "# RSE-PF experiment: faults of a live map",
-        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} Hz; "
-        f"{sum(row[-1] == 'met' for row in bars)} of {len(bars)} targets met.",
+        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} Hz; {met}",
         table(head, rows),
-        table(["fault", "figure", "measured", "target", ""], bars),
+        bars,
         *(f"![{name}]({name}/{_FIGURE})" for name in runs),
         about_run(report),
     )

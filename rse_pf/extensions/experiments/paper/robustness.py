@@ -20,7 +20,7 @@ from rse_pf.extensions.experiments.paper.control_plane_fault import run_control_
 from rse_pf.extensions.experiments.paper.elasticity import crashes, slowest_replacement_s
 from rse_pf.extensions.experiments.paper.fault_scenarios import SCENARIOS
 from rse_pf.extensions.experiments.plots.figures import draw_robustness, require_matplotlib
-from rse_pf.extensions.experiments.results.bars import with_bars
+from rse_pf.extensions.experiments.results.bars import bars_blocks, missed_bars, with_bars
 from rse_pf.extensions.experiments.results.markdown import about_run, failures, number, page, slashed, table
 from rse_pf.extensions.experiments.results.records import (
     CommandRecord,
@@ -50,7 +50,6 @@ from rse_pf.terminal import show
 __all__ = [
     "BARS",
     "RobustnessOptions",
-    "find_missed_bars",
     "robustness_figures",
     "robustness_page",
     "run_robustness",
@@ -169,7 +168,7 @@ async def _run(
 
 
 def _line(name: str, run: Mapping[str, Any]) -> str:
-    commands, outage, missed = run["commands"], run["gap_s"], find_missed_bars(run)
+    commands, outage, missed = run["commands"], run["gap_s"], missed_bars(run)
     return (
         f"{name:<15} {commands['sent']} commands, {commands['lost']} lost, {commands['twice']} twice, "
         f"{commands['failed']} failed; outage p50 {outage['p50']} s, p99 {outage['p99']} s; "
@@ -247,11 +246,6 @@ def robustness_figures(records: Records) -> dict[str, Any]:
     return with_bars(figures, bars)
 
 
-def find_missed_bars(figures: Mapping[str, Any]) -> list[str]:
-    """Return the names of the figures that missed their targets."""
-    return [name for name, bar in figures["bars"].items() if not bar["held"]]
-
-
 def robustness_page(report: Mapping[str, Any]) -> str:
     """Return the text of ``report.md``: a table of figures, and each target with whether it was met."""
     runs: Mapping[str, Mapping[str, Any]] = report["runs"]
@@ -267,20 +261,15 @@ def robustness_page(report: Mapping[str, Any]) -> str:
         ]
         for name, run in runs.items()
     ]
-    bars = [
-        [name, figure, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
-        for name, run in runs.items()
-        for figure, bar in run["bars"].items()
-    ]
+    met, bars = bars_blocks(runs)
     head = (
         "fault, sent, lost, twice, failed, outage p50 / p99 s, out of rotation s, replaced s, other figures"
     )
     return page(
         "# RSE-PF experiment: robustness",
-        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} fps, real PnP problems; "
-        f"{sum(row[-1] == 'met' for row in bars)} of {len(bars)} targets met.",
+        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} fps, real PnP problems; {met}",
         table(head.split(", "), rows),
-        table(["fault", "figure", "measured", "target", ""], bars),
+        bars,
         "Outage: the longest time between two answers, of the robots on the affected server (of all "
         "robots where the fault affects all). At 5 fps it is 0.2 s without any fault.",
         about_run(report),

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["Bars", "with_bars"]
+from rse_pf.extensions.experiments.results.markdown import number, table
+
+__all__ = ["Bars", "bars_blocks", "is_met", "missed_bars", "with_bars"]
 
 Bars = Mapping[str, tuple[float, str]]
 """Targets of figures: limit and ``<=`` or ``>=``, by the path of the figure, such as ``gap_s/p99``."""
@@ -19,9 +21,29 @@ def with_bars(figures: Mapping[str, Any], bars: Bars) -> dict[str, Any]:
     return {**figures, "bars": {name: _check_bar(figures, name, *bar) for name, bar in bars.items()}}
 
 
+def is_met(value: Any, sense: str, limit: float) -> bool:
+    """Return whether *value* is at most (``<=``) or at least (``>=``) *limit*; None never is."""
+    return value is not None and bool(value <= limit if sense == "<=" else value >= limit)
+
+
+def missed_bars(figures: Mapping[str, Any]) -> list[str]:
+    """Return the names of the figures of a run that missed their targets."""
+    return [name for name, bar in figures["bars"].items() if not bar["held"]]
+
+
+def bars_blocks(runs: Mapping[str, Mapping[str, Any]]) -> tuple[str, list[str]]:
+    """Return for a page how many targets of *runs* were met, and the table of all targets."""
+    rows = [
+        [name, figure, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
+        for name, run in runs.items()
+        for figure, bar in run["bars"].items()
+    ]
+    met = sum(row[-1] == "met" for row in rows)
+    return f"{met} of {len(rows)} targets met.", table(["fault", "figure", "measured", "target", ""], rows)
+
+
 def _check_bar(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
     value: Any = figures
     for step in name.split("/"):
         value = value[step]
-    held = value is not None and (value <= bar if sense == "<=" else value >= bar)
-    return {"value": value, "bar": f"{sense} {bar:g}", "held": held}
+    return {"value": value, "bar": f"{sense} {bar:g}", "held": is_met(value, sense, bar)}

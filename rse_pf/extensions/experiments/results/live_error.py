@@ -20,7 +20,7 @@ from rse_pf.errors import RsePfError, UsageError
 from rse_pf.extensions.experiments.results.map_error import move_frames
 from rse_pf.extensions.experiments.results.markdown import number, table
 from rse_pf.extensions.experiments.results.records import TRUTH
-from rse_pf.extensions.experiments.results.trajectory_error import align, match_truth
+from rse_pf.extensions.experiments.results.trajectory_error import align, matched_poses, residuals_m, rms
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, decode_map
 
@@ -200,11 +200,11 @@ def alignment_errors(drives: Sequence[LiveDrive], version: MapVersion | None) ->
     for drive in drives:
         placed = [frame for frame in drive.frames if frame["T_map"] is not None]
         path = _trajectory(placed, "T_map")
-        try:
-            rows, true_poses = match_truth(path, _truth(drive))
-        except UsageError:
+        matched = matched_poses(path, drive.truth)
+        if matched is None:
             errors.append((np.empty(0), np.empty(0)))
             continue
+        rows, true_poses = matched
         moved = path.positions[rows] @ T[:3, :3].T + T[:3, 3]
         distances = np.linalg.norm(moved - true_poses[:, :3, 3], axis=1)
         errors.append((np.array([placed[row]["t"] for row in rows]), 100.0 * distances))
@@ -268,12 +268,6 @@ def _trajectory(frames: Sequence[Mapping[str, Any]], which: str) -> Trajectory:
     return Trajectory(np.array([frame["stamp"] for frame in frames], dtype=np.float64), poses)
 
 
-def _truth(drive: LiveDrive) -> Trajectory:
-    if drive.truth is None:
-        raise UsageError("the truth is not known", hint="choose a recording with a ground truth")
-    return drive.truth
-
-
 def _join_frame(drive: LiveDrive) -> int | None:
     """Return the number (from 0) of the robot's first frame aligned by the map server.
 
@@ -287,13 +281,8 @@ def _match_positions(path: Trajectory, truth: Trajectory | None) -> tuple[Array,
 
     None if there are fewer than three.
     """
-    if truth is None:
-        return None
-    try:
-        rows, true_poses = match_truth(path, truth)
-    except UsageError:
-        return None
-    return path.positions[rows], true_poses[:, :3, 3]
+    matched = matched_poses(path, truth)
+    return None if matched is None else (path.positions[matched[0]], matched[1][:, :3, 3])
 
 
 def _together_cm(paths: Iterable[Trajectory], drives: Sequence[LiveDrive]) -> float | None:
@@ -302,9 +291,7 @@ def _together_cm(paths: Iterable[Trajectory], drives: Sequence[LiveDrive]) -> fl
     if not known or len(known) < len(pairs):
         return None
     points, wanted = (np.concatenate([pair[column] for pair in known]) for column in (0, 1))
-    _, T = align(points, wanted)
-    distances = np.linalg.norm(points @ T[:3, :3].T + T[:3, 3] - wanted, axis=1)
-    return round(100.0 * float(np.sqrt(np.mean(np.square(distances)))), 4)
+    return round(100.0 * rms(residuals_m(points, wanted)), 4)
 
 
 def _owners(drives: Sequence[LiveDrive]) -> list[str]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
-from rse_pf.extensions.experiments.results.bars import with_bars
+from rse_pf.extensions.experiments.results.bars import missed_bars, with_bars
 from rse_pf.extensions.experiments.results.live_error import (
     LiveDrive,
     live_figures,
@@ -109,7 +109,7 @@ def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
         than = (
             f" ({ate - sum(undisturbed) / len(undisturbed):+.2f})" if undisturbed and ate is not None else ""
         )
-        missed = [figure for figure, bar in run["bars"].items() if not bar["held"]]
+        missed = missed_bars(run)
         rows.append(
             [
                 name,

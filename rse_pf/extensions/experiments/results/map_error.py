@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from client_sdk.trajectory import Trajectory
-from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.results.markdown import table
-from rse_pf.extensions.experiments.results.trajectory_error import align, match_truth
+from rse_pf.extensions.experiments.results.trajectory_error import matched_poses, residuals_m, rms
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply
@@ -195,24 +194,24 @@ def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
     if not robots or any(pair is None for pair in pairs):
         return {"ate_cm": None, "ate_before_cm": None, "ate_stiff_cm": None, "origins": []}
     known = [pair for pair in pairs if pair is not None]
-    together = _residuals(
+    together = residuals_m(
         np.concatenate([merged[:, :3, 3] for _, merged, _ in known]),
         np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
     )
-    stiff = _residuals(
+    stiff = residuals_m(
         np.concatenate([(_rigid_motion(own, merged) @ own)[:, :3, 3] for own, merged, _ in known]),
         np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
     )
-    before = np.concatenate([_residuals(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
+    before = np.concatenate([residuals_m(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
     _, first, first_truth = known[0]
     origins = []
     for robot, (_, merged, truth) in zip(robots[1:], known[1:], strict=True):
         off_m, off_deg = pose_difference(inverse(first[0]) @ merged[0], inverse(first_truth[0]) @ truth[0])
         origins.append({"robot": robot.name, "cm": round(100 * off_m, 3), "deg": round(off_deg, 3)})
     return {
-        "ate_cm": round(100 * _rms(together), 4),
-        "ate_before_cm": round(100 * _rms(before), 4),
-        "ate_stiff_cm": round(100 * _rms(stiff), 4),
+        "ate_cm": round(100 * rms(together), 4),
+        "ate_before_cm": round(100 * rms(before), 4),
+        "ate_stiff_cm": round(100 * rms(stiff), 4),
         "origins": origins,
     }
 
@@ -222,12 +221,10 @@ def _match_poses(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
 
     None if fewer than three frames have one.
     """
-    if robot.truth is None:
+    matched = matched_poses(robot.merged, robot.truth)
+    if matched is None:
         return None
-    try:
-        rows, true_poses = match_truth(robot.merged, robot.truth)
-    except UsageError:
-        return None
+    rows, true_poses = matched
     return robot.own.T_world_camera[rows], robot.merged.T_world_camera[rows], true_poses
 
 
@@ -242,13 +239,3 @@ def _rigid_motion(own: Array, merged: Array) -> Array:
     T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     T[:3, 3] = (merged[:, :3, 3] - own[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
     return T
-
-
-def _residuals(points: Array, wanted: Array) -> Array:
-    _, T = align(points, wanted)
-    distances: Array = np.linalg.norm(points @ T[:3, :3].T + T[:3, 3] - wanted, axis=1)
-    return distances
-
-
-def _rms(distances: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(distances))))

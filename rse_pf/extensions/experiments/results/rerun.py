@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.bars import Bars
+from rse_pf.extensions.experiments.results.bars import Bars, is_met
 
 __all__ = ["RERUN", "FigureReached", "rerun_arguments", "rerun_figures", "rerun_plan"]
 
@@ -90,9 +90,12 @@ def _limit(bar: str, slack: float) -> tuple[str, float]:
 
 
 def _check_bar(name: str, sense: str, limit: float, *, value: Any, reported: Any) -> FigureReached:
-    is_reached = value is not None and (value <= limit if sense == "<=" else value >= limit)
     return FigureReached(
-        name=name, value=value, bar=f"{sense} {limit:g}", reported=reported, is_reached=is_reached
+        name=name,
+        value=value,
+        bar=f"{sense} {limit:g}",
+        reported=reported,
+        is_reached=is_met(value, sense, limit),
     )
 
 

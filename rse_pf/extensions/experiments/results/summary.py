@@ -19,6 +19,7 @@ from rse_pf.extensions.experiments.results.records import CommandRecord, Records
 __all__ = [
     "PAPER",
     "ROUND_TRIP_PARTS",
+    "frame_rates",
     "longest_outages",
     "outage_figures",
     "percent_answered",
@@ -102,6 +103,21 @@ def percentiles(values: Sequence[float]) -> dict[str, float | int | None]:
     p50, p95, p99, largest = np.percentile(values, [50, 95, 99, 100])
     named = {"mean": float(np.mean(values)), "p50": p50, "p95": p95, "p99": p99, "max": largest}
     return {"n": len(values), **{name: round(float(value), 3) for name, value in named.items()}}
+
+
+def frame_rates(commands: Sequence[CommandRecord]) -> list[float]:
+    """Return the answers per second of each robot that sent two commands or more, while it sent them."""
+    by_robot: dict[str, list[CommandRecord]] = defaultdict(list)
+    for command in commands:
+        by_robot[command.robot].append(command)
+    rates = []
+    for own in by_robot.values():
+        planned = [record.planned for record in own]
+        sending_s = max(planned) - min(planned)
+        if sending_s > 0:  # n frames span n - 1 intervals
+            answered = sum(record.code == "ok" for record in own)
+            rates.append(answered * (len(own) - 1) / len(own) / sending_s)
+    return rates
 
 
 def robots_on(commands: Sequence[CommandRecord], server: str, at_s: float) -> set[str]:

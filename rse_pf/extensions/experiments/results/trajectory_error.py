@@ -22,7 +22,9 @@ __all__ = [
     "align",
     "ate_m",
     "match_truth",
-    "motion_errors",
+    "matched_poses",
+    "residuals_m",
+    "rms",
     "trajectory_figures",
     "with_truth",
 ]
@@ -57,6 +59,14 @@ class Accuracy:
     compared: Trajectory
     aligned: Trajectory
     truth: Trajectory
+
+    def figures(self) -> dict[str, float | None]:
+        """Return ATE and RPE in centimetres and degrees, by the names that reports use."""
+        return {
+            "ate_cm": 100 * self.ate_m,
+            "rpe_cm": None if self.rpe_m is None else 100 * self.rpe_m,
+            "rpe_deg": self.rpe_deg,
+        }
 
 
 def accuracy(
@@ -95,12 +105,12 @@ def accuracy(
     _, T_truth_estimate = align(poses[:, :3, 3], true_poses[:, :3, 3])
     poses = T_truth_estimate @ poses
     distances = np.linalg.norm(poses[:, :3, 3] - true_poses[:, :3, 3], axis=1)
-    metres, degrees = motion_errors(stamps_s, poses, true_poses)
+    metres, degrees = _motion_errors(stamps_s, poses, true_poses)
     return Accuracy(
-        ate_m=_rms(distances),
+        ate_m=rms(distances),
         ate_max_m=float(distances.max()),
-        rpe_m=_rms(metres) if len(metres) else None,
-        rpe_deg=_rms(degrees) if len(degrees) else None,
+        rpe_m=rms(metres) if len(metres) else None,
+        rpe_deg=rms(degrees) if len(degrees) else None,
         rpe_max_deg=float(degrees.max()) if len(degrees) else None,
         poses=len(rows),
         scale=scale,
@@ -142,7 +152,7 @@ def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.boo
     return np.asarray(is_between | (nearest <= SAME_STAMP_S))
 
 
-def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:
+def _motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:
     """Return the errors (metres, degrees) of the motion from each pose to the pose `STEP_S` later.
 
     Poses without another one at that time, within half the median interval, have no error in the arrays.
@@ -159,10 +169,7 @@ def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Arr
 
 def ate_m(T_estimate: Array, T_truth: Array) -> float:
     """Return the rmse (m) of the positions of poses ``(n, 4, 4)`` after the least-squares SE(3) alignment."""
-    positions, wanted = T_estimate[:, :3, 3], T_truth[:, :3, 3]
-    _, T_truth_estimate = align(positions, wanted)
-    moved = positions @ T_truth_estimate[:3, :3].T + T_truth_estimate[:3, 3]
-    return _rms(np.linalg.norm(moved - wanted, axis=1))
+    return rms(residuals_m(T_estimate[:, :3, 3], T_truth[:, :3, 3]))
 
 
 def trajectory_figures(
@@ -181,11 +188,8 @@ def trajectory_figures(
     }
     if truth is not None:
         with contextlib.suppress(UsageError):
-            errors = accuracy(estimate, truth, T_body_camera=T_body_camera)
-            figures["ate_cm"] = round(100 * errors.ate_m, 4)
-            if errors.rpe_m is not None and errors.rpe_deg is not None:
-                figures["rpe_cm"] = round(100 * errors.rpe_m, 4)
-                figures["rpe_deg"] = round(errors.rpe_deg, 4)
+            errors = accuracy(estimate, truth, T_body_camera=T_body_camera).figures()
+            figures |= {name: None if value is None else round(value, 4) for name, value in errors.items()}
     return figures
 
 
@@ -212,5 +216,25 @@ def align(points: Array, wanted: Array, *, with_scale: bool = False) -> tuple[fl
     return scale, pose
 
 
-def _rms(values: Array) -> float:
+def matched_poses(
+    estimate: Trajectory, truth: Trajectory | None
+) -> tuple[npt.NDArray[np.int64], Array] | None:
+    """Return the result of `match_truth`; None without a truth, or if fewer than three poses have one."""
+    if truth is None:
+        return None
+    try:
+        return match_truth(estimate, truth)
+    except UsageError:
+        return None
+
+
+def residuals_m(points: Array, wanted: Array) -> Array:
+    """Return the distances ``(n,)`` of *points* from *wanted*, after one rigid alignment of all *points*."""
+    _, T = align(points, wanted)
+    distances: Array = np.linalg.norm(points @ T[:3, :3].T + T[:3, 3] - wanted, axis=1)
+    return distances
+
+
+def rms(values: Array) -> float:
+    """Return the root of the mean square of *values*."""
     return float(np.sqrt(np.mean(np.square(values))))
