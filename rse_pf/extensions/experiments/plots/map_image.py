@@ -7,6 +7,7 @@ installs.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rse_pf.errors import MissingExtra
 from rse_pf.geometry import Array
 from rse_pf.terminal import printable
 
-__all__ = ["COLOURS", "SCALES_M", "RobotPath", "draw_map", "fitting", "pillow"]
+__all__ = ["COLOURS", "INK", "RobotPath", "draw_legend", "draw_map", "draw_scale", "fitting", "pillow"]
 
 _WIDTH = 1600  # of the image, in pixels
 _HEIGHT = 900  # of the image, in pixels
@@ -26,7 +27,7 @@ _CAPTION = 64  # height in pixels of the strips at the top and the bottom in whi
 _MARGIN = 40  # pixels between the border of the image and its content
 # Background of the image, as RGB: not white, so that white surfaces differ from regions without points.
 _BACKGROUND = (228, 231, 236)
-_INK = (30, 34, 42)
+INK = (30, 34, 42)
 _WHITE = (255, 255, 255)
 COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
 """Colours of the paths of robots (RGB), distinct for colour-blind readers as well; Okabe and Ito 2008."""
@@ -37,13 +38,14 @@ _MAX_LABELS = 8
 _FOCAL = 1.35
 # Distance along a path, in metres, after which the next camera is drawn on it.
 _CAMERA_EVERY_M = 0.5
-SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
-"""Lengths of the scale bar in metres, or in the unit of the map.
-
-The first that has a suitable length in pixels
-is used."""
+# Lengths of a scale bar in metres, or in the unit of the map; the first of a suitable length is used.
+_SCALES = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
 # Shortest and longest scale bar, in pixels.
-_SCALE_PX = (80.0, 400.0)
+_SCALE_PX = (60.0, 300.0)
+# Height of a line of the legend, in pixels.
+_LEGEND_LINE = 24
+# Distance from the beginning of a line's colour to its name in the legend, in pixels.
+_LEGEND_TEXT = 38
 # A scene whose horizontal extent is longer than wide by more than this ratio is drawn from its long side.
 _LONG_SCENE = 1.25
 # Points more than this far above the highest camera, in metres, are a ceiling and are not drawn.
@@ -96,12 +98,18 @@ def draw_map(
     if 1 < len(robots) <= _MAX_LABELS:
         for robot, place in zip(robots, _label_places(view, robots), strict=True):
             draw.text(
-                place, robot.name, fill=_INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
+                place, robot.name, fill=INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
             )
-    scale_left = _draw_scale(draw, view, small, unit)
+    ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
+    one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
+    bottom = _HEIGHT - 34
+    scale_left = draw_scale(draw, one_px, (_WIDTH - _MARGIN, bottom), unit, small)
     text = fitting(draw, printable(caption), big, _WIDTH - 2 * _MARGIN)
-    draw.text((_MARGIN, 18), text, fill=_INK, font=big)
-    _draw_legend(draw, robots, small, scale_left - _MARGIN)
+    draw.text((_MARGIN, 18), text, fill=INK, font=big)
+    names = [robot.name for robot in robots]
+    names[:1] = [f"{name} (dot: start, ring: end)" for name in names[:1]]
+    entries = [(name, COLOURS[number % len(COLOURS)]) for number, name in enumerate(names)]
+    draw_legend(draw, entries, (_MARGIN, bottom), scale_left - _MARGIN, small)
     image.save(path, format="PNG")
 
 
@@ -256,18 +264,32 @@ def _label_places(view: _Observer, robots: list[RobotPath]) -> list[tuple[float,
     return places
 
 
-def _draw_legend(draw: Any, robots: list[RobotPath], font: Any, max_px: float) -> None:
-    """Draw one line with the names of the robots; for the names that do not fit, write "and N more"."""
-    left, y = _MARGIN, _HEIGHT - 34
-    for number, robot in enumerate(robots):
-        label = f"{robot.name} (dot: start, ring: end)" if number == 0 else robot.name
-        length = int(draw.textlength(label, font=font))
-        if left + 46 + length > max_px:
-            draw.text((left, y), f"and {len(robots) - number} more", fill=_INK, font=font, anchor="lm")
-            return
-        draw.line([(left, y), (left + 36, y)], fill=COLOURS[number % len(COLOURS)], width=6)
-        draw.text((left + 46, y), label, fill=_INK, font=font, anchor="lm")
-        left += 76 + length
+def draw_legend(
+    draw: Any,
+    entries: Sequence[tuple[str, tuple[int, int, int]]],
+    corner: tuple[float, float],
+    right: float,
+    font: Any,
+    *,
+    lines: int = 1,
+) -> None:
+    """Draw names with their colours, between *corner* and *right* in pixels, in at most *lines* lines.
+
+    For the names that do not fit, "and N more" is written.
+    """
+    left, y = corner
+    x, last = left, y + (lines - 1) * _LEGEND_LINE
+    for number, (name, colour) in enumerate(entries):
+        text = fitting(draw, name, font, right - left - _LEGEND_TEXT)
+        length = draw.textlength(text, font=font)
+        if x > left and x + _LEGEND_TEXT + length > right:
+            if y + _LEGEND_LINE > last:
+                draw.text((x, y), f"and {len(entries) - number} more", fill=INK, font=font, anchor="lm")
+                return
+            x, y = left, y + _LEGEND_LINE
+        draw.line([(x, y), (x + 30, y)], fill=colour, width=5)
+        draw.text((x + _LEGEND_TEXT, y), text, fill=INK, font=font, anchor="lm")
+        x += _LEGEND_TEXT + length + 24
 
 
 def fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
@@ -297,21 +319,19 @@ def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tupl
     draw.line([*flat[1:], flat[1]], fill=colour, width=2)
 
 
-def _draw_scale(draw: Any, view: _Observer, font: Any, unit: str) -> float:
-    """Draw the scale bar at the lower right; return the x at which its label begins, in pixels.
+def draw_scale(draw: Any, one_px: float, end: tuple[float, float], unit: str, font: Any) -> float:
+    """Draw a scale bar that ends at *end*; return the x at which its label begins, in pixels.
 
-    The bar has a round length in *unit*, as long as that length appears at the centre of the scene.
+    The bar has a round length in *unit*, of which *one_px* is the length in pixels.
     """
-    ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
-    one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
-    units = next((m for m in SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
-    length, label = min(units * one_px, _WIDTH / 2), f"{units:g} {unit}"
-    right, y = _WIDTH - _MARGIN, _HEIGHT - 34
-    draw.line([(right - length, y), (right, y)], fill=_INK, width=3)
-    for x in (right - length, right):
-        draw.line([(x, y - 7), (x, y + 7)], fill=_INK, width=3)
-    draw.text((right - length - 16, y), label, fill=_INK, font=font, anchor="rm")
-    return right - length - 16 - float(draw.textlength(label, font=font))
+    length = next((m for m in _SCALES if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
+    label, (right, y) = f"{length:g} {unit}", end
+    left = right - min(length * one_px, _SCALE_PX[1])
+    draw.line([(left, y), (right, y)], fill=INK, width=3)
+    for x in (left, right):
+        draw.line([(x, y - 7), (x, y + 7)], fill=INK, width=3)
+    draw.text((left - 16, y), label, fill=INK, font=font, anchor="rm")
+    return left - 16 - float(draw.textlength(label, font=font))
 
 
 def _up(robots: list[RobotPath]) -> Array:

@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.plots.map_image import COLOURS, SCALES_M, fitting, pillow
+from rse_pf.extensions.experiments.plots.map_image import (
+    COLOURS,
+    INK,
+    draw_legend,
+    draw_scale,
+    fitting,
+    pillow,
+)
 from rse_pf.geometry import Array
 from rse_pf.terminal import printable
 
@@ -28,13 +35,10 @@ _LEGEND = 92  # height of a panel's legend, in pixels
 _MARGIN = 28  # pixels between the border of a panel and its content
 _ACROSS = 2  # panels in a row of the image
 _PAPER = (255, 255, 255)
-_INK = (30, 34, 42)
 _TRUTH = (150, 156, 166)
 _FRAME = (228, 231, 236)
 # A path is not drawn across a gap of more than this many times the median interval between poses.
 _BREAK = 2.5
-# Shortest and longest scale bar, in pixels.
-_SCALE_PX = (60.0, 300.0)
 # Largest number of panels in an image.
 _MOST_PANELS = 24
 
@@ -95,13 +99,13 @@ def _draw_panel(draw: Any, panel: Panel, corner: tuple[int, int], fonts: tuple[A
     big, small = fonts
     draw.rectangle([left, top, left + _WIDTH - 1, top + _HEIGHT - 1], outline=_FRAME, width=2)
     title = fitting(draw, printable(panel.title), big, _WIDTH - 2 * _MARGIN)
-    draw.text((left + _MARGIN, top + 12), title, fill=_INK, font=big)
+    draw.text((left + _MARGIN, top + 12), title, fill=INK, font=big)
     shown = [
         each.positions for each in (panel.truth, *(drawn.path for drawn in panel.paths)) if each is not None
     ]
     points = np.concatenate([*shown, np.empty((0, 3))])
     if not len(points):
-        draw.text((left + _MARGIN, top + _TITLE + 20), "no poses", fill=_INK, font=small)
+        draw.text((left + _MARGIN, top + _TITLE + 20), "no poses", fill=INK, font=small)
         return
     basis = _basis(points if panel.truth is None else panel.truth.positions)
     flat = points @ basis
@@ -125,9 +129,10 @@ def _draw_panel(draw: Any, panel: Panel, corner: tuple[int, int], fonts: tuple[A
         line(panel.truth, _TRUTH, 7)
     for number, drawn in enumerate(panel.paths):
         line(drawn.path, COLOURS[number % len(COLOURS)], 3)
-        legend.append((drawn.name, COLOURS[number % len(COLOURS)]))
-    _draw_scale(draw, scale, (left + _WIDTH - _MARGIN, top + _HEIGHT - _LEGEND - 6), panel.unit, small)
-    _draw_legend(draw, legend, (left + _MARGIN, top + _HEIGHT - _LEGEND + 14), small)
+        legend.append((printable(drawn.name), COLOURS[number % len(COLOURS)]))
+    right = left + _WIDTH - _MARGIN
+    draw_scale(draw, scale, (right, top + _HEIGHT - _LEGEND - 6), panel.unit, small)
+    draw_legend(draw, legend, (left + _MARGIN, top + _HEIGHT - _LEGEND + 14), right, small, lines=3)
 
 
 def _basis(positions: Array) -> Array:
@@ -136,29 +141,3 @@ def _basis(positions: Array) -> Array:
     _, _, axes = np.linalg.svd(centred.T @ centred)
     basis: Array = axes[:2].T
     return basis
-
-
-def _draw_scale(draw: Any, scale: float, end: tuple[float, float], unit: str, font: Any) -> None:
-    length = next((m for m in SCALES_M if _SCALE_PX[0] <= m * scale <= _SCALE_PX[1]), 1.0)
-    x, y = end
-    draw.line([(x - length * scale, y), (x, y)], fill=_INK, width=3)
-    draw.text((x - length * scale - 10, y), f"{length:g} {unit}", fill=_INK, font=font, anchor="rm")
-
-
-def _draw_legend(
-    draw: Any, entries: Sequence[tuple[str, tuple[int, int, int]]], corner: tuple[float, float], font: Any
-) -> None:
-    """Draw names with their colours, in as many lines as fit; for the other names, write "and N more"."""
-    left, y = corner
-    x, right, last = left, left + _WIDTH - 2 * _MARGIN, y + _LEGEND - 40
-    for number, (name, colour) in enumerate(entries):
-        text = fitting(draw, printable(name), font, right - left - 40)
-        length = draw.textlength(text, font=font)
-        if x > left and x + 36 + length > right:
-            x, y = left, y + 24
-        if y > last:
-            draw.text((x, y), f"and {len(entries) - number} more", fill=_INK, font=font, anchor="lm")
-            return
-        draw.line([(x, y), (x + 26, y)], fill=colour, width=5)
-        draw.text((x + 34, y), text, fill=_INK, font=font, anchor="lm")
-        x += 56 + length
