@@ -19,7 +19,6 @@ from client_sdk.point_map import write_ply
 from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
-from rse_pf.errors import CommandFailed, NotFound
 from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.extensions.experiments.results.map_error import JoinedRobot, joined_robots, merge_section
 from rse_pf.maps.format import MapVersion, decode_map
@@ -29,7 +28,6 @@ __all__ = [
     "MAP_FILE",
     "MERGED_MAP",
     "MergeMaps",
-    "commit",
     "merge_on_platform",
     "print_tenths",
     "write_merged",
@@ -69,16 +67,10 @@ def write_merged(
         merge: Merges the encoded maps.
 
     Raises:
-        CommandFailed: A robot made no keyframe.
         MissingExtra: The extra "maps" is not installed where the merge runs.
     """
     encoded = [(folder / name / MAP_FILE).read_bytes() for name in names]
     versions = [decode_map(data) for data in encoded]
-    empty = [name for name, version in zip(names, versions, strict=True) if not version.keyframes]
-    if empty:
-        raise CommandFailed(
-            f"{empty[0]} has no keyframe, so there is nothing to merge", hint="raise --frames"
-        )
     reply, origin = merge(encoded)
     merged = decode_map(reply.map)
     robots = joined_robots(names, paths, truths, versions, reply, merged)
@@ -132,9 +124,8 @@ def merge_on_platform(
             reply = decode_reply(data.download(answer.object), MergeReply)
         else:
             reply = answer.reply
-        version = commit(
-            data, MERGED_NAME, reply.map, f"merged {', '.join(names[row] for row in reply.joined)}"
-        )
+        note = f"merged {', '.join(names[row] for row in reply.joined)}"
+        version = data.update_map(MERGED_NAME, reply.map, note=note)
     finally:
         data.close()
     return reply, {
@@ -143,15 +134,6 @@ def merge_on_platform(
         "transfer_s": round(stored_s, 3),
         "map": {"name": MERGED_NAME, "version": version},
     }
-
-
-def commit(data: DataClient, name: str, encoded: bytes, note: str) -> str:
-    """Commit *encoded* as the next version of the map *name* with *note*; return the id of the version."""
-    try:
-        parent: str | None = data.map_version(name)["id"]
-    except NotFound:
-        parent = None
-    return data.commit_map(name, encoded, parent=parent, note=note)
 
 
 def print_tenths(say: Callable[[str], None]) -> Callable[[float, str], None]:

@@ -30,10 +30,10 @@ from client_sdk.point_map import write_ply
 from client_sdk.robot import Robot
 from client_sdk.source_facts import DoubtLog, unresolved
 from client_sdk.trajectory import Trajectory, write_trajectory
+from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
-from rse_pf.errors import RsePfError, error_of_system
+from rse_pf.errors import CommandFailed, RsePfError, UsageError, error_of_system
 from rse_pf.extensions.experiments.child_process import ChildFailed, ChildReady, ParentPipe
-from rse_pf.extensions.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
 from rse_pf.extensions.experiments.demo.live import LIVE_NAME, LiveRecorder
 from rse_pf.extensions.experiments.demo.merge import MAP_FILE
 from rse_pf.extensions.experiments.results.records import TRUTH, CommandRecord
@@ -247,11 +247,10 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
                 mapper = Mapper(
                     ask=ask, depth=loaded.has_depth, options=options.frontend_options, T_world_start=start,
-                    features=load_features(options.features),
+                    keyframes_of=spec.name if options.merge else "", features=load_features(options.features),
                 )  # fmt: skip
             pipe.send(ChildReady(len(frames)))
             began = planned = await asyncio.to_thread(pipe.wait_start)
-            collector = _collector(spec, pipe.token)
             recorder = LiveRecorder(shared, time.monotonic, began).start() if options.live else None
             check = DriveCheck(
                 is_wanted=options.check and options.data is not None, is_thinned=loaded.is_thinned
@@ -270,8 +269,6 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 done = await mapper.track(frame)
                 if recorder is not None:
                     recorder.frame(done)
-                if done.T_world_camera is not None and collector is not None:
-                    await asyncio.to_thread(collector.add, done)
                 drive.tracked.append(done)
                 await asyncio.to_thread(check.add, frame, done)
                 pipe.send(FrameDone(row + 1))
@@ -279,7 +276,9 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         if recorder is not None:
             await recorder.finish(spec.folder)
         trajectory = mapper.trajectory
-        uploaded = await asyncio.to_thread(_write, spec.folder, mapper, trajectory, truth, collector)
+        await asyncio.to_thread(_write, spec.folder, mapper, trajectory, truth)
+        if isinstance(mapper, Mapper) and options.merge:
+            await asyncio.to_thread(_upload_map, spec, mapper, pipe.token)
         pipe.send(
             RobotFinished(
                 frames=mapper.frames,
@@ -296,11 +295,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 trajectory=trajectory,
                 truth=truth,
                 truth_kind=loaded.truth_kind,
-                stats={
-                    "reconnects": robot.stats.reconnects,
-                    "resent": robot.stats.resent,
-                    "keyframes_uploaded": uploaded,
-                },
+                stats={"reconnects": robot.stats.reconnects, "resent": robot.stats.resent},
                 is_metric=_is_metric(mapper),
                 check=await asyncio.to_thread(_checked, check, mapper, loaded, options.accepted),
             )
@@ -388,25 +383,10 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
     return _Loaded(frames, truth, "ground truth", True)
 
 
-def _collector(spec: RobotSpec, token: Callable[[], str]) -> KeyframeCollector | None:
-    if not spec.options.merge:
-        return None
-    uploads = KeyframeUploads(spec.url, token)
-    features = load_features(spec.options.features)
-    return KeyframeCollector(spec.name, spec.options.frontend_options, uploads, features)
-
-
 def _write(
-    folder: Path,
-    mapper: Mapper | LiveMapper,
-    trajectory: Trajectory,
-    truth: Trajectory | None,
-    collector: KeyframeCollector | None,
-) -> int:
-    """Write cloud, trajectory and truth of the robot; with *collector* also write and upload its map.
-
-    Return the number of keyframes that were uploaded, 0 without *collector*.
-    """
+    folder: Path, mapper: Mapper | LiveMapper, trajectory: Trajectory, truth: Trajectory | None
+) -> None:
+    """Write cloud and trajectory of the robot, and its truth if that is known."""
     points, colours = mapper.map.points(min_readings=_MIN_READINGS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(
@@ -417,8 +397,24 @@ def _write(
     )
     if truth is not None:
         write_trajectory(folder / TRUTH, truth)
-    if collector is None:
-        return 0
-    data = collector.encoded_map(points, colours)
-    (folder / MAP_FILE).write_bytes(data)
-    return collector.upload_map(data)
+
+
+def _upload_map(spec: RobotSpec, mapper: Mapper, token: Callable[[], str]) -> None:
+    """Write the robot's keyframes and cloud to its folder, and commit them as the map of the robot's name.
+
+    Raises:
+        CommandFailed: No keyframe has a pose in metres.
+    """
+    try:
+        encoded = mapper.encoded_map()
+    except UsageError as error:
+        raise CommandFailed(
+            "no keyframe has a pose in metres, so there is nothing to merge",
+            hint="let the robot have depth, and play more frames",
+        ) from error
+    (spec.folder / MAP_FILE).write_bytes(encoded)
+    client = DataClient(spec.url, token)
+    try:
+        client.update_map(spec.name, encoded, note="a drive of the demo")
+    finally:
+        client.close()

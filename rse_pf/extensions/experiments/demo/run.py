@@ -291,15 +291,13 @@ def _merge(
     """Merge the maps that the robots have committed, on the platform; return the figures for the report."""
     names = robot_names(len(finished))
     url, token = platform.url, platform.issue_token("operator")
-    section = write_merged(
+    return write_merged(
         folder,
         names,
         [robot.trajectory for robot in finished],
         [robot.truth for robot in finished],
         lambda _: merge_on_platform(url, token, names, settings.session, print_tenths(screen.print)),
     )
-    section["keyframes_uploaded"] = sum(robot.stats["keyframes_uploaded"] for robot in finished)
-    return section
 
 
 def _write_results(
