@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.extensions.experiments.paper.robustness import robustness_figures
+from rse_pf.extensions.experiments.results.bars import bars_blocks
 from rse_pf.extensions.experiments.results.records import CommandRecord, Records
 
 
@@ -86,3 +87,17 @@ def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
     assert judged["not_adopted"] == not_adopted
     assert judged["control_plane_down_s"] == pytest.approx(4.0)
     assert judged["bars"]["not_adopted"]["held"] is (not_adopted == 0)
+
+
+def test_the_page_counts_and_names_the_targets_that_were_missed():
+    runs = {
+        "kill": robustness_figures(run("kill", KILL, [*HIT, *OTHER])),
+        "kill-2": robustness_figures(run("kill", KILL, [*HIT, *OTHER, unanswered(None, "")])),
+    }
+
+    count, table = bars_blocks(runs)
+
+    assert count == "11 of 12 targets met."
+    assert [line for line in table if "missed" in line] == [
+        "| kill-2 | commands/lost | 1 | <= 0 | **missed** |"
+    ]
