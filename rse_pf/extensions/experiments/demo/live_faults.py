@@ -86,11 +86,9 @@ class LiveFault:
         latest = (_EARLIEST + _LATEST) / 2 if LIVE_FAULTS[self.name] > _LONG_S else _LATEST
         return drive_s * random.Random(self.seed).uniform(_EARLIEST, latest)
 
-    @contextlib.contextmanager
-    def environment(self, folder: Path) -> Any:
-        """Set up the environment in which the platform must be started; for "store", its stores can fail."""
-        with failing_environment(folder) if self.name == "store" else contextlib.nullcontext():
-            yield
+    def environment(self, folder: Path) -> contextlib.AbstractContextManager[None]:
+        """Return the environment in which the platform must be started; for "store", its stores can fail."""
+        return failing_environment(folder) if self.name == "store" else contextlib.nullcontext()
 
     @contextlib.asynccontextmanager
     async def disturb(self, platform: LocalPlatform, store: Path, log: Log) -> AsyncIterator[Disturbance]:
@@ -179,29 +177,26 @@ class Disturbance:
         elif name == "store":
             self._log("fault", **event, percent=_FAILING_PERCENT)
             await self._fail_store(seconds)
-        elif name == "roll":
-            self._log("fault", **event, owner=owner.owner, server=owner.server)
-            await self._platform.roll()
-        elif name == "drain":
-            self._log("fault", **event, owner=owner.owner, server=owner.server)
-            await self._platform.drain(owner.server, reason="experiment: drain of the owner's server")
-        elif name == "kill":
-            self._log("fault", **event, owner=owner.owner, server=owner.server)
-            self._platform.kill(owner.server)
         else:
-            await self._stop(owner, event)
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
+            await self._disturb_server(name, owner.server, seconds)
         self._log("fault-over", fault=name)
 
-    async def _stop(self, owner: LeaseRecord, what: dict[str, Any]) -> None:
-        """Stop all processes of the server that serves the map by SIGSTOP; continue them after the fault."""
-        server = next(candidate for candidate in self._platform.servers if candidate.name == owner.server)
-        self._log("fault", **what, owner=owner.owner, server=owner.server)
-        stopped = signal_tree(server.mark, signal.SIGSTOP)
-        self._log("stopped", processes=stopped)
-        try:
-            await asyncio.sleep(what["seconds"])
-        finally:
-            signal_tree(server.mark, signal.SIGCONT)
+    async def _disturb_server(self, fault: str, name: str, seconds: float) -> None:
+        """Kill, drain or replace the server *name*, or stop all of its processes for *seconds*."""
+        if fault == "kill":
+            self._platform.kill(name)
+        elif fault == "drain":
+            await self._platform.drain(name, reason="experiment: drain of the owner's server")
+        elif fault == "roll":
+            await self._platform.roll()
+        else:
+            server = next(candidate for candidate in self._platform.servers if candidate.name == name)
+            self._log("stopped", processes=signal_tree(server.mark, signal.SIGSTOP))
+            try:
+                await asyncio.sleep(seconds)
+            finally:
+                signal_tree(server.mark, signal.SIGCONT)
 
     async def _fail_store(self, seconds: float) -> None:
         folder = self._folder / "failing-store"

@@ -31,9 +31,6 @@ INK = (30, 34, 42)
 _WHITE = (255, 255, 255)
 COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
 """Colours of the paths of robots (RGB), distinct for colour-blind readers as well; Okabe and Ito 2008."""
-# Largest number of robots whose names are drawn next to their paths; with more, names stand in the legend
-# only.
-_MAX_LABELS = 8
 # Focal length of the camera of the image, relative: the result is scaled to fill the image afterwards.
 _FOCAL = 1.35
 # Distance along a path, in metres, after which the next camera is drawn on it.
@@ -95,11 +92,6 @@ def draw_map(
         _draw_path(draw, view, robot, COLOURS[number % len(COLOURS)])
     for number, robot in enumerate(robots):
         _draw_ends(draw, view, robot, COLOURS[number % len(COLOURS)])
-    if 1 < len(robots) <= _MAX_LABELS:
-        for robot, place in zip(robots, _label_places(view, robots), strict=True):
-            draw.text(
-                place, robot.name, fill=INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
-            )
     ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
     one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
     bottom = _HEIGHT - 34
@@ -237,33 +229,6 @@ def _draw_ends(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, 
     draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=_WHITE, width=3)
 
 
-def _label_places(view: _Observer, robots: list[RobotPath]) -> list[tuple[float, float]]:
-    """Return for each robot the pixel at which its name is drawn: near its path, far from the other paths.
-
-    A robot without a path gets a pixel outside the image.
-    """
-    lines = [view.project(robot.T_world_camera[:, :3, 3]) for robot in robots]
-    places = []
-    for number, line in enumerate(lines):
-        if not len(line):
-            places.append((-100.0, -100.0))
-            continue
-        spots = line[:: max(1, len(line) // 50)]
-        spots = np.concatenate([spots + np.array(off) for off in ((0, -34), (0, 34), (70, 0), (-70, 0))])
-        taken = [other for row, other in enumerate(lines) if row != number] + [
-            np.array(places).reshape(-1, 2)
-        ]
-        others = np.concatenate(taken)
-        if len(others):
-            free = np.linalg.norm(spots[:, None] - others[None], axis=2).min(axis=1)
-        else:
-            free = np.zeros(len(spots))
-        inside = (np.abs(spots - [_WIDTH / 2, _HEIGHT / 2]) < [_WIDTH / 2 - 60, _HEIGHT / 2 - 80]).all(axis=1)
-        x, y = spots[int(np.argmax(np.where(inside, free, -1.0)))]
-        places.append((float(x), float(y)))
-    return places
-
-
 def draw_legend(
     draw: Any,
     entries: Sequence[tuple[str, tuple[int, int, int]]],
@@ -282,9 +247,12 @@ def draw_legend(
     for number, (name, colour) in enumerate(entries):
         text = fitting(draw, name, font, right - left - _LEGEND_TEXT)
         length = draw.textlength(text, font=font)
-        if x > left and x + _LEGEND_TEXT + length > right:
-            if y + _LEGEND_LINE > last:
-                draw.text((x, y), f"and {len(entries) - number} more", fill=INK, font=font, anchor="lm")
+        has_next_line = y + _LEGEND_LINE <= last
+        more = f"and {len(entries) - number} more"
+        reserved = 0 if has_next_line or number == len(entries) - 1 else draw.textlength(more, font=font) + 24
+        if x > left and x + _LEGEND_TEXT + length + reserved > right:
+            if not has_next_line:
+                draw.text((x, y), more, fill=INK, font=font, anchor="lm")
                 return
             x, y = left, y + _LEGEND_LINE
         draw.line([(x, y), (x + 30, y)], fill=colour, width=5)
