@@ -17,13 +17,13 @@ export interface RobotOptions {
    * A robot that its servers refuse goes on reconnecting. The first connect and `close` are not reported.
    */
   onChange?: (what: "link-lost" | "link-back" | "moved" | "refused", why: string) => void;
-  /** Time until the Welcome; default 4000. */
+  /** Longest duration of an attempt, until the Welcome; default 4000. */
   connectTimeoutMs?: number;
-  /** A connection with an unanswered command on which nothing arrives for so long is lost; default 1000. */
+  /** A connection with an unanswered command counts as lost if nothing arrives on it for this time; default 1000. */
   stallTimeoutMs?: number;
   /** Address of the data service, if it is not that of the servers. */
   dataUrl?: string;
-  /** The class of WebSockets, where the runtime has none of its own. */
+  /** Class of WebSockets, for a runtime without one. */
   WebSocket?: unknown;
 }
 
@@ -36,9 +36,9 @@ export interface CallOptions {
   keep?: boolean;
   /** A word of at most 64 characters that is found in the server's log. */
   trace?: string;
-  /** Called with the progress of a long service, 0 to 1; with it there is no default deadline. */
+  /** Called with the progress of a long service: the part that is done (0 to 1), and its step. No default deadline then. */
   onProgress?: (done: number, what: string) => void;
-  /** Its abort takes the command back: it ends with `cancelled`. */
+  /** Cancels the command when it is aborted: the command ends with `cancelled`. */
   signal?: AbortSignal;
 }
 
@@ -133,7 +133,7 @@ export interface Robot {
   call<Reply = any>(service: string, payload?: unknown, options?: CallOptions): Promise<Answer<Reply>>;
   /** Estimate the pose of a camera; points are rounded to 0.1 mm and 0.01 px. */
   solvePnp(request: PnpRequest, options?: CallOptions): Promise<Answer<PnpReply>>;
-  /** Ask for the updates of a topic, such as `live/MAP`, on this and all later connections. */
+  /** Subscribe to a topic, such as `live/MAP`, on this and all later connections; returns a function that unsubscribes. */
   subscribe(
     topic: string,
     onUpdate: (key: string, payload: any, seq: number) => void,
@@ -162,7 +162,7 @@ export class RsePfError extends Error {
   readonly trace: string;
 }
 
-/** How messages are written and read, by the name of the codec. */
+/** Encoders and decoders of messages, by the name of the codec. */
 export const codecs: Record<
   "json" | "zlib",
   {

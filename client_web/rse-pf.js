@@ -1,32 +1,41 @@
 /**
  * RSE-PF for browsers, web workers and Node: one robot, connected to the backend servers of a platform.
  *
- * The rules are those of docs/protocol.md; its section is named where a rule is applied.  The module has no
- * dependencies, stores nothing, and writes to the console only what callbacks throw.  Inside, times
- * are seconds of a clock that never jumps; names that begin with `_` are internal, and the minifier may shorten them.
+ * The rules are those of docs/protocol.md; comments name its sections.  The module has no dependencies, stores
+ * nothing, and writes nothing but exceptions of callbacks to the console.  Internal times are seconds of a monotonic
+ * clock.  Names that begin with `_` are internal, and the minifier may shorten them.
  */
 
-const FIRST_TRIES = 4;
-// After some that failed Chromium delays a WebSocket by up to 5 s; it may repeat the packets of one itself.
-const LONG_TRY_MS = 11e3;
+// Attempts of `connect` before it rejects.
+const FIRST_ATTEMPTS = 4;
+// Longest attempt to connect after an unanswered one: Chromium then delays a WebSocket by up to 5 s.
+const LONG_ATTEMPT_MS = 11e3;
+// Time between two pings, and longest wait for a pong.
 const PING_S = 2;
 const PONG_S = 3;
+// Default deadline of a command, and time for which a cancelled command counts as unanswered.
 const ANSWER_S = 5;
-// A service that issues tokens answers within seconds; a later answer counts as none.
+// Longest duration of a call of the token function.
 const TOKEN_MS = 3e4;
 const MAX_DEADLINE_MS = 3.6e6;
+// Largest message of a server after decompression, and largest JSON text of a command.
 const MAX_INFLATED_BYTES = 1 << 20;
+// Commands wait while the socket holds more unsent bytes than this, so that newer frames can replace them.
 const MAX_BUFFERED_BYTES = 1 << 16;
+// Largest object that is stored by one PUT, and largest part of an upload.
 const MAX_PUT_BYTES = 1 << 18;
 const MAX_PART_BYTES = 1 << 20;
+// Undecodable messages after which a connection is closed.
 const MAX_BAD_MESSAGES = 10;
+// Largest budget of commands that are sent again after `busy`; each new command adds 0.1 to the budget.
 const MAX_RETRIES = 5;
-// The longest pause of a stream after one busy answer.
+// Longest pause of a stream after one `busy` answer.
 const MAX_PAUSE_S = 60;
-// A client that uses a little less than its limits is not refused when a network bunches messages.
-const SHARE = 0.9;
-// A first connect and the calls wait for the end of a refusal that is so near.
-const SOON_S = 2;
+// Used part of the server's rate limit: a network may deliver messages closer together than they were sent.
+const RATE_SHARE = 0.9;
+// The first connect and calls wait for the end of a refusal that ends within this time.
+const NEAR_S = 2;
+// Smallest change of the difference of wall clock and monotonic clock that counts as a set clock.
 const CLOCK_SET_S = 0.5;
 
 const { min, max, random, round } = Math;
@@ -40,7 +49,7 @@ const nothing = () => {};
 const bytesOf = (data) => new Uint8Array(data);
 const sizeOf = (data) => data.byteLength ?? data.length;
 
-/** Return what ends a promise, with an error or a value; *late* is called if nothing has after *ms*. */
+/** Return a function that settles a promise; *late* is called if the promise is not settled within *ms*. */
 const ending = (resolve, reject, ms, late) => {
   const timeout = late && setTimeout(late, ms);
   return (failed, value) => {
@@ -49,11 +58,11 @@ const ending = (resolve, reject, ms, late) => {
   };
 };
 
-// The codes that are used most.
+// Codes of errors.
 const CONNECT = "connect";
 const UNSUPPORTED = "unsupported";
 const USAGE = "usage";
-// The sentences that are used twice.
+// Messages of errors.
 const NO_ANSWER = "no answer";
 const TOO_LARGE = "message too large";
 
@@ -65,17 +74,17 @@ export class RsePfError extends Error {
   }
 }
 
-const wrong = (...words) => new RsePfError(...words);
-const told = (failure) => wrong(failure.code, failure.message, failure.hint, failure);
-const unreadable = (message) => wrong("protocol", message, "no RSE-PF server?");
-const cancelled = () => wrong("cancelled", "taken back");
+const makeError = (...words) => new RsePfError(...words);
+const errorOf = (failure) => makeError(failure.code, failure.message, failure.hint, failure);
+const unreadable = (message) => makeError("protocol", message, "no RSE-PF server?");
+const cancelled = () => makeError("cancelled", "cancelled by the program");
 const unauthorized = (message = "no valid token", hint = "use a fresh token") =>
-  wrong("unauthorized", message, hint);
+  makeError("unauthorized", message, hint);
 
 // --- codecs (section 1) ----------------------------------------------------------------------------------
 
-/** Return *bytes* after a compression stream; throws if that is more than *limit* bytes, or the stream fails. */
-const through = async ({ writable, readable }, bytes, limit) => {
+/** Return the output of a compression stream for *bytes*; throws if the output is longer than *limit* bytes. */
+const transform = async ({ writable, readable }, bytes, limit) => {
   const writer = writable.getWriter();
   const reader = readable.getReader();
   let whole = bytesOf();
@@ -88,27 +97,27 @@ const through = async ({ writable, readable }, bytes, limit) => {
       if (whole.length > limit) throw unreadable(TOO_LARGE);
     }
   };
-  // A stream that refuses what is written gives its reader nothing, not even an error.
+  // A stream that refuses its input gives its reader no error: the writer has to be awaited, too.
   await Promise.all([read(), writer.write(bytes), writer.close()]);
   return whole;
 };
 
-/** Begin *work* now, and call *then* with its result once *before* is over; rejects with what either throws. */
+/** Begin *work* now, and call *then* with its result once *before* has settled; rejects with the error of either. */
 const inOrder = (before, work, then) =>
   Promise.allSettled([(async () => work())(), before]).then(([{ value, reason }]) => {
     if (reason) throw reason;
     then(value);
   });
 
-/** Name -> how the text of a message becomes the content of a WebSocket message, and how that is read. */
+/** The codecs by name: `encode` makes a WebSocket message of JSON text, and `decode` parses such a message. */
 export const codecs = {
   json: { encode: (text) => text, decode: parse },
   zlib: {
-    encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
+    encode: (text) => transform(new CompressionStream("deflate"), new TextEncoder().encode(text)),
     decode: async (data) =>
       parse(
         new TextDecoder("utf-8", { fatal: true }).decode(
-          await through(new DecompressionStream("deflate"), bytesOf(data), MAX_INFLATED_BYTES),
+          await transform(new DecompressionStream("deflate"), bytesOf(data), MAX_INFLATED_BYTES),
         ),
       ),
   },
@@ -127,7 +136,7 @@ const textOf = (value) => {
   try {
     return JSON.stringify(value, plain) ?? "null";
   } catch (failed) {
-    throw wrong(USAGE, "no JSON: " + failed.message, "send finite numbers");
+    throw makeError(USAGE, "no JSON: " + failed.message, "send finite numbers");
   }
 };
 
@@ -135,14 +144,14 @@ const rounded = (values, scale) => from(values, (value) => round(value * scale) 
 
 const sha256 = async (bytes) => {
   if (!crypto.subtle) {
-    throw wrong(UNSUPPORTED, "no sha256 here", "use https or localhost");
+    throw makeError(UNSUPPORTED, "no sha256 here", "use https or localhost");
   }
   return from(bytesOf(await crypto.subtle.digest("SHA-256", bytes)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 };
 
 // --- a connection ----------------------------------------------------------------------------------------
 
-/** Return whether the claims of a token say that it has expired; one that cannot be read has not. */
+/** Return whether the claims of a token say that it has expired; false if the claims cannot be read. */
 const isExpired = (token) => {
   try {
     return parse(atob(token.split(".")[1].replace(/[-_]/g, (sign) => (sign < "_" ? "+" : "/")))).exp < unixTime();
@@ -153,7 +162,7 @@ const trimmed = (token) => `${token || ""}`.trim();
 const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
 
 const BROKEN = ["protocol", "defect of this client"];
-/** Close codes after which a robot connects again much later (section 6): code and sentence of its error. */
+/** Close codes that refuse the robot for long (section 6): code, message and hint of the error. */
 const REFUSALS = {
   1002: BROKEN,
   1007: BROKEN,
@@ -164,8 +173,8 @@ const REFUSALS = {
   4409: ["conflict", "another one replaced it", "one token per robot"],
 };
 
-/** Node's words for an attempt that reached nobody; a browser tells no more than whether it is online. */
-const NOWHERE = /^E(NET|HOST|AI_|NOTF|TIMED)|^Timeout/;
+/** Codes of Node for an attempt that reached no server; a browser says only whether it is online. */
+const UNREACHABLE = /^E(NET|HOST|AI_|NOTF|TIMED)|^Timeout/;
 const isOnline = () => navigator.onLine;
 
 /** Mark an error as the refusal of a server: the robot connects again in 20 to 40 s, or once its tokens are valid. */
@@ -174,8 +183,8 @@ const refused = (failed, validInS = Infinity) => {
   return failed;
 };
 
-/** Return whether an error is a refusal, and not one that is known to be over soon. */
-const lasts = (failed) => failed._validInS > SOON_S;
+/** Return whether an error is a refusal that is not known to end within `NEAR_S`. */
+const lasts = (failed) => failed._validInS > NEAR_S;
 
 /** Connect a robot: resolves at the first Welcome, rejects with an RsePfError; see rse-pf.d.ts. */
 export const connect = async (url, options = {}) => {
@@ -185,8 +194,8 @@ export const connect = async (url, options = {}) => {
     stallTimeoutMs = 1000, dataUrl = httpUrl, WebSocket = globalThis.WebSocket,
   } = options;
   const { encode, decode } = codecs[codec] || {};
-  if (!encode) throw wrong(USAGE, `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
-  if (!WebSocket) throw wrong(UNSUPPORTED, "no WebSocket", "use Node 22 or newer");
+  if (!encode) throw makeError(USAGE, `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
+  if (!WebSocket) throw makeError(UNSUPPORTED, "no WebSocket", "use Node 22 or newer");
   const stallS = stallTimeoutMs / 1e3;
   const links = new Set();
   const pending = new Map();
@@ -210,25 +219,25 @@ export const connect = async (url, options = {}) => {
   let notBefore = 0;
   let isKeeping = false;
   let lateUntil = 0;
-  let share = SHARE;
+  let share = RATE_SHARE;
   let retries = MAX_RETRIES;
   let renewal = nothing;
   let error = null;
 
-  /** Call a function of the program; what it throws, at once or as a promise, is reported, and rejects. */
+  /** Call a function of the program; count and report its exception or rejection, and reject with it. */
   const guarded = async (call, ...words) => {
     try {
       return await call(...words);
     } catch (failed) {
       counts.callbackErrors++;
-      // The place that throws, or the text of what has none: each is printed once.
+      // Print one exception of each line of code that throws.
       const what = `${/.*:\d+:\d+/.exec(failed?.stack) ?? failed}`;
       if (printed.size < printed.add(what).size) console.error("rse-pf callback:", failed);
       throw failed;
     }
   };
 
-  /** Call a function of the program when this turn is over, so that it cannot disturb the session. */
+  /** Call a function of the program in a later microtask, so that its exception cannot disturb the session. */
   const later = async (...words) => {
     await 0;
     guarded(...words).catch(nothing);
@@ -237,7 +246,7 @@ export const connect = async (url, options = {}) => {
   // --- connect, reconnect, move --------------------------------------------------------------------------
 
   const isSource = typeof token === "function";
-  /** Ask the token function of the program; rejects if it has not answered within TOKEN_MS. */
+  /** Call the token function of the program; rejects if it takes longer than TOKEN_MS. */
   const askToken = () => {
     let timeout;
     const late = (_, reject) => (timeout = setTimeout(reject, TOKEN_MS, new DOMException("no token", "TimeoutError")));
@@ -247,7 +256,7 @@ export const connect = async (url, options = {}) => {
     try {
       return trimmed(isSource ? await guarded(askToken) : token);
     } catch (failed) {
-      throw wrong(CONNECT, "no token: " + failed?.name, "fix its function");
+      throw makeError(CONNECT, "no token: " + failed?.name, "fix the token function");
     }
   };
 
@@ -271,13 +280,13 @@ export const connect = async (url, options = {}) => {
       );
     } catch (failed) {
       // Its message may contain the token.
-      throw refused(wrong(USAGE, "no WebSocket: " + failed.name, "wss: from https pages"));
+      throw refused(makeError(USAGE, "no WebSocket: " + failed.name, "wss: from https pages"));
     }
     link._socket = socket;
     links.add(link);
     socket.binaryType = "arraybuffer";
     return new Promise((resolve, reject) => {
-      link._end = ending(resolve, reject, isOnline() && trouble._isUnanswered ? LONG_TRY_MS : connectTimeoutMs, () => {
+      link._end = ending(resolve, reject, isOnline() && trouble._isUnanswered ? LONG_ATTEMPT_MS : connectTimeoutMs, () => {
         lateUntil = now() + 60;
         const failed = unreadable("no Welcome");
         failed._isUnanswered = !socket.readyState;
@@ -287,7 +296,7 @@ export const connect = async (url, options = {}) => {
         socket.protocol === protocol
           ? say(link, "hello", { sdk, capabilities: ["progress", "updates"] })
           : lose(link, refused(unreadable("it does not speak " + protocol)));
-      socket.onmessage = (event) => hear(link, event.data);
+      socket.onmessage = (event) => receiveData(link, event.data);
       // Node 22 has no close event for a handshake that failed; elsewhere it follows.
       socket.onerror = () => {
         if (link._welcome) return;
@@ -308,8 +317,8 @@ export const connect = async (url, options = {}) => {
       notBefore = now() + 5;
     }
     const refusalOfCode = REFUSALS[code];
-    let failed = wrong(...(refusalOfCode || [CONNECT, "closed with " + code, "up? token valid? origin allowed?"]));
-    // An attempt that was given up may still replace the connection that came after it.
+    let failed = makeError(...(refusalOfCode || [CONNECT, "closed with " + code, "up? token valid? origin allowed?"]));
+    // A connection of an abandoned attempt may still replace the one that was opened after it: no refusal.
     const isOwn = code === 4409 && (current?._moveUntil || now() < lateUntil);
     if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
     else if (isRevoked || code === 4401 || (isOpening && isExpired(link._token))) {
@@ -320,33 +329,33 @@ export const connect = async (url, options = {}) => {
     lose(link, failed);
   };
 
-  /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
+  /** Return why a handshake failed, by an HTTP request, in Node and in pages of the platform's origin; else *failed*. */
   const reasonOf = async (link, failed, isStatic) => {
     const { host } = new URL(httpUrl);
-    // A request more for each attempt would double what a firewall counts.
+    // Not for each attempt: a firewall would count twice as many requests.
     if ((attempt % 4 === 1 || refusal) && (globalThis.location?.host ?? host) === host) {
       try {
         const answer = await fetch(httpUrl, { headers: bearer(link._token), signal: AbortSignal.timeout(1e3) });
         const { platform, message, hint, valid_from_s: validFromS } = await answer.json();
         if (answer.status === 401 && platform === "rse-pf") {
-          // The same token stays revoked, and so does a new one if the clock that signs is behind.
+          // A fixed token stays revoked; so does a new one if the clock that signs it is behind the cut-off.
           const validInS = validFromS - unixTime();
-          return refused(unauthorized(message, hint), !isStatic && validInS > -SOON_S ? validInS : Infinity);
+          return refused(unauthorized(message, hint), !isStatic && validInS > -NEAR_S ? validInS : Infinity);
         }
       } catch (problem) {
-        failed._isUnanswered = NOWHERE.test(problem.cause?.code || problem.name);
+        failed._isUnanswered = UNREACHABLE.test(problem.cause?.code || problem.name);
       }
     }
     return failed;
   };
 
-  /** Return how long to wait before the next attempt (section 1), from the start of the last one, which took *spent*. */
+  /** Return the pause before the next attempt (section 1); *spent* is the duration of the last attempt, in seconds. */
   const pauseAfter = (spent) => {
     const jitter = random();
     const { _validInS: validInS, _isUnanswered: isUnanswered } = trouble;
     if (validInS != null) return min(20 + 20 * jitter, max(0, validInS) + jitter / 2);
     if (isUnanswered) return 1 + jitter / 4 - spent;
-    // Without a network nobody is spared, but Chromium counts what fails.
+    // Without a network no server needs to be spared, but Chromium delays attempts after failures.
     const longest = min(40, (now() - failingAt) / (isOnline() === false ? 1 : 3));
     return longest > 1 ? (longest * (1 + jitter)) / 2 - spent : jitter * min(1, 0.1 * 2 ** attempt);
   };
@@ -365,8 +374,8 @@ export const connect = async (url, options = {}) => {
       const until = max(notBefore, now() + pauseAfter(now() - began));
       const offset = clockOffset();
       const wasOnline = isOnline();
-      // Not so long if the clock of this machine is set, which may make tokens valid, or if there is another token
-      // or a network.
+      // The pause ends early if the clock of this machine is set, which may make tokens valid, if the program gives
+      // another token, or if the network is back or gone.
       while (now() < until && !error && trouble === before && isOnline() === wasOnline && (clockOffset() - offset) ** 2 < CLOCK_SET_S ** 2) {
         await pause(0.1);
       }
@@ -381,9 +390,9 @@ export const connect = async (url, options = {}) => {
           const isBetter = !current || (current._moveUntil && link._welcome.server !== current._welcome.server);
           isBetter ? adopt(link) : lose(link);
         } catch (failed) {
-          if (adoptedAt < 0 && (lasts(failed) || attempt >= FIRST_TRIES)) end(failed);
+          if (adoptedAt < 0 && (lasts(failed) || attempt >= FIRST_ATTEMPTS)) end(failed);
           note(failed);
-          // Whoever was not reached need not be spared.
+          // A server that was not reached needs no longer pauses.
           if (failed._isUnanswered) {
             failingAt = Infinity;
             if (adoptedAt >= 0) attempt--;
@@ -394,7 +403,7 @@ export const connect = async (url, options = {}) => {
     isKeeping = false;
   };
 
-  /** Take why there is no connection; a refusal that lasts ends the calls, and the robot goes on trying. */
+  /** Record why there is no connection. A refusal that lasts ends all calls, and the robot goes on reconnecting. */
   const note = (failed) => {
     trouble = failed;
     if (current || error || !lasts(failed)) return;
@@ -415,7 +424,7 @@ export const connect = async (url, options = {}) => {
     if (before) {
       before._isLeaving = true;
       counts.moves++;
-      // A job continues on any server, so the old connection can close now.
+      // A job continues on any server, so its command need not keep the old connection open.
       pending.forEach((each) => {
         if (each._isLong && !each._isCancelled) each._link = null;
       });
@@ -430,7 +439,7 @@ export const connect = async (url, options = {}) => {
   /** Return the commands that have no answer on *link*. */
   const sentOn = (link) => [...pending.values()].filter((each) => each._link === link);
 
-  /** Forget a connection, because it *failed* or is not needed; its commands wait for the next one. */
+  /** Close and remove a connection; *failed* is the reason, if any. Its commands wait for the next connection. */
   const lose = (link, failed) => {
     if (!links.delete(link)) return;
     link._socket.close(1000);
@@ -461,29 +470,29 @@ export const connect = async (url, options = {}) => {
 
   const say = (link, type, fields) => send(link, textOf({ type, ...fields }));
 
-  /** Write a message after those before it; its *command*, if any, ends if it is too large. */
+  /** Send a message in the order of calls. A message of a *command* that is too large ends the command instead. */
   const send = (link, text, command) => {
     link._left--;
     const write = (data) => {
       const size = sizeOf(data);
       if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
-        settle(command, wrong("too-large", `${size} bytes are too many`, "upload it, name its digest"));
+        settle(command, makeError("too-large", `${size} bytes are too many`, "upload it, name its digest"));
       } else if (links.has(link)) {
         counts.bytesOut += size;
         link._socket.send(data);
       }
     };
-    const stop = (failed) => lose(link, wrong(UNSUPPORTED, failed.message, "use another codec"));
+    const stop = (failed) => lose(link, makeError(UNSUPPORTED, failed.message, "use another codec"));
     link._outgoing = inOrder(link._outgoing, () => encode(text), write).catch(stop);
   };
 
-  const hear = (link, data) => {
+  const receiveData = (link, data) => {
     link._heardAt = now();
     counts.bytesIn += sizeOf(data);
     link._incoming = inOrder(link._incoming, () => decode(data), (message) => receive(link, message)).catch((problem) => {
       const failed = unreadable("cannot read it: " + problem);
-      const isDamaged = problem?.name; // otherwise it is a type that is not known here
-      // It may have been the answer to any of them, and would not be readable when it came again.
+      const isDamaged = problem?.name; // an Error; an unknown type of message is thrown as text
+      // The message may have been the answer to any of these commands, and a repeated answer would be as unreadable.
       if (isDamaged) settleAll(sentOn(link), failed);
       if ((isDamaged && !link._welcome) || ++link._bad > MAX_BAD_MESSAGES) lose(link, failed);
     });
@@ -497,7 +506,7 @@ export const connect = async (url, options = {}) => {
     const subscription = subscriptions.get(id);
     const isHere = link === current;
     const isOfLink = each?._link === link;
-    const take = {
+    const handlers = {
       __proto__: null,
       welcome() {
         link._welcome = message;
@@ -532,12 +541,12 @@ export const connect = async (url, options = {}) => {
         }
       },
       failure() {
-        const failed = told(message);
+        const failed = errorOf(message);
         const { code } = message;
         const isBusy = code === "busy";
         const after = time + (message.retry_after_ms || 0) / 1e3;
         if (id == null) {
-          // It is about a message or the session, not about one command.
+          // The failure is about a message or the session, not about one command.
           if (isBusy) {
             link._left = 0;
             link._filledAt = after;
@@ -574,20 +583,21 @@ export const connect = async (url, options = {}) => {
           });
         }
       },
-    }[type];
-    if (!take) throw type;
-    take();
+    };
+    const handle = handlers[type];
+    if (!handle) throw type;
+    handle();
     flush();
   };
 
   const cancel = (each) => {
     if (each._isCancelled || each._isSettled) return;
-    if (each._isLong) withdraw(each); // its answer says whether the job ended before
+    if (each._isLong) withdraw(each); // the answer of the server says whether the job had already ended
     else giveUp(each, cancelled());
     schedule();
   };
 
-  /** End a command for its caller; it counts for the server until its answer comes. */
+  /** End a command for its caller; it counts towards `max_in_flight` until the server answers it. */
   const giveUp = (each, failed) => {
     settle(each, failed);
     if (!each._link) return;
@@ -595,18 +605,18 @@ export const connect = async (url, options = {}) => {
     withdraw(each);
   };
 
-  /** Cancel a command, on its server only if that has told of progress. */
+  /** Mark a command as cancelled; ask its server to cancel it if the server has reported progress. */
   const withdraw = (each) => {
     each._isCancelled = true;
     each._until = now() + ANSWER_S;
     if (each._isLong && each._link) say(each._link, "cancel", { id: each._id });
   };
 
-  /** End a command if it comes before number *newest* of its stream; return whether it does. */
+  /** End a command whose number in its stream is below *newest* as `stale`; return whether it was. */
   const isReplaced = (each, newest) =>
-    !each._keep && each._seq < newest && !settle(each, wrong("stale", "a newer one came"));
+    !each._keep && each._seq < newest && !settle(each, makeError("stale", "a newer command came"));
 
-  const expired = (each, time) => wrong("expired", `no answer within ${round((time - each._from) * 1e3)} ms`);
+  const expired = (each, time) => makeError("expired", `no answer within ${round((time - each._from) * 1e3)} ms`);
 
   const settle = (each, failed, result) => {
     pending.delete(each._id);
@@ -627,10 +637,10 @@ export const connect = async (url, options = {}) => {
     link._renewAt = now() + 0.8 * seconds;
   };
 
-  /** Return how many commands may be sent (section 4, "Rate"), or minus the seconds until one may. */
+  /** Return how many commands may be sent now (section 4, "Rate"), or minus the seconds until the next one may. */
   const allowance = (time) => {
     const { _limits: limits } = current;
-    // What does not leave the machine yet can still be replaced by a newer frame.
+    // A command that is not yet given to the socket can still be replaced by a newer one.
     if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) return -0.02;
     const rate = limits.max_commands_per_s * share;
     if (!rate) return Infinity;
@@ -652,9 +662,9 @@ export const connect = async (url, options = {}) => {
         if (each._link || isReplaced(each, newest)) return;
         const heldS = busyUntil - time;
         const isBusy = heldS > 0;
-        // A command that the pause of a busy server outlasts ends at once, by that server's answer.
+        // A command whose deadline is before the end of the pause ends at once, with the busy answer of the server.
         if (isBusy && busyUntil >= each._until) {
-          return settle(each, told({ ...busy, trace: each._trace, retry_after_ms: heldS * 1e3 }));
+          return settle(each, errorOf({ ...busy, trace: each._trace, retry_after_ms: heldS * 1e3 }));
         }
         const why = isBusy ? "busy" : room-- > 0 ? 0 : "own-limit";
         if (why) return (each._isHeld ||= ++counts.heldBack[why]);
@@ -681,10 +691,10 @@ export const connect = async (url, options = {}) => {
     flush();
   };
 
-  /** Send a ping when one is due, and find lost connections (section 4, "A lost connection"). */
+  /** Send a ping if one is due, and close a connection that counts as lost (section 4, "A lost connection"). */
   const check = (link, time) => {
     if (!link._welcome) return;
-    // A program that did not run for a while cannot tell whether the server was silent in that time.
+    // This program was blocked or suspended: the server may have sent messages meanwhile.
     if (time - link._checkedAt >= stallS) {
       link._heardAt = time;
       link._unansweredAt &&= time;
@@ -693,7 +703,7 @@ export const connect = async (url, options = {}) => {
     const first = min(...sentOn(link).map((each) => (each._isLong ? Infinity : each._at)));
     const isSilent = time - max(link._heardAt, first) >= stallS;
     if (isSilent || time - (link._unansweredAt ?? time) >= PONG_S) {
-      return lose(link, wrong(CONNECT, NO_ANSWER));
+      return lose(link, makeError(CONNECT, NO_ANSWER));
     }
     if (time - link._pingedAt >= (first < time ? min(PING_S, stallS / 3) : PING_S)) {
       link._unansweredAt ??= time;
@@ -707,7 +717,7 @@ export const connect = async (url, options = {}) => {
     }
   };
 
-  /** Set the timer for what is due next. */
+  /** Set the timer for the next deadline, ping or end of a pause. */
   const schedule = () => {
     const time = now();
     const room = current ? allowance(time) : 1;
@@ -725,7 +735,7 @@ export const connect = async (url, options = {}) => {
 
   // --- data (docs/data.md) -------------------------------------------------------------------------------
 
-  /** Send a request to the data service, again where that may help. */
+  /** Send a request to the data service; repeat it after a lost connection and after 408, 429, 500, 502, 503 and 504. */
   const http = async (method, path, body, signal, more) => {
     const address = new URL("/data/v1/" + path, dataUrl);
     for (let tries = 0; ; tries++) {
@@ -735,14 +745,14 @@ export const connect = async (url, options = {}) => {
       if (signal?.aborted) throw cancelled();
       const { status, name } = response;
       const failed = status
-        ? told({ code: "store", message: "HTTP " + status, ...(await response.json().catch(nothing)) })
-        : wrong(CONNECT, "no data service: " + name, "see serving.allowed_origins");
+        ? errorOf({ code: "store", message: "HTTP " + status, ...(await response.json().catch(nothing)) })
+        : makeError(CONNECT, "no data service: " + name, "see serving.allowed_origins");
       if (tries > 4 || (status && !/408|429|50[0234]/.test(status))) throw failed;
       await pause(random() * 0.2 * 2 ** tries);
     }
   };
 
-  // --- what programs use ---------------------------------------------------------------------------------
+  // --- public interface ----------------------------------------------------------------------------------
 
   const robot = {
     get server() {
@@ -766,7 +776,7 @@ export const connect = async (url, options = {}) => {
         const { deadlineMs, stream, keep: isKept, trace, onProgress, signal } = options;
         if (error || refusal || signal?.aborted) throw error || refusal || cancelled();
         if (!((deadlineMs ?? 1) > 0) || deadlineMs > MAX_DEADLINE_MS) {
-          throw wrong(USAGE, `deadlineMs is within 0..${MAX_DEADLINE_MS}, not ${deadlineMs}`);
+          throw makeError(USAGE, `deadlineMs is within 0..${MAX_DEADLINE_MS}, not ${deadlineMs}`);
         }
         const time = now();
         const id = ++lastId;
@@ -776,7 +786,7 @@ export const connect = async (url, options = {}) => {
         const seq = lane._sent + 1;
         const each = {
           _id: id, _lane: lane, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal, _trace: trace,
-          // As text, so that the caller may use the arrays again.
+          // Encoded now, so that the caller may change the arrays afterwards.
           _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
           _payload: textOf(payload),
           _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
@@ -819,7 +829,7 @@ export const connect = async (url, options = {}) => {
         renewal(cancelled());
         trouble = {};
         if (!current) return resolve();
-        renewal = ending(resolve, reject, ANSWER_S * 1e3, () => reject(wrong("expired", NO_ANSWER)));
+        renewal = ending(resolve, reject, ANSWER_S * 1e3, () => reject(makeError("expired", NO_ANSWER)));
         say(current, "renew", { token: fresh });
       }),
 
@@ -850,11 +860,11 @@ export const connect = async (url, options = {}) => {
 
     download: async (digest, { signal } = {}) => {
       const bytes = bytesOf(await (await http("GET", "objects/" + digest, null, signal)).arrayBuffer());
-      if ((await sha256(bytes)) !== digest) throw wrong("store", "its digest differs", "try again");
+      if ((await sha256(bytes)) !== digest) throw makeError("store", "its digest differs", "try again");
       return bytes;
     },
 
-    close: () => end(wrong("disconnected", "closed")),
+    close: () => end(makeError("disconnected", "closed")),
   };
 
   await keep();

@@ -23,9 +23,9 @@ _TARGETS = (
     "codec", "frames", "stream", "geometry", "maps", "keyframes", "snapshots", "graph", "cloud",
     "match", "depth", "describe", "track", "stereo", "live",
 )  # fmt: skip
-"""Not read from `fuzz.targets`, which atheris has to import by itself."""
+"""Names of `fuzz.targets.TARGETS`, repeated here because atheris has to instrument that import."""
 _OF_THE_CORE = frozenset({"match", "depth", "describe", "track", "stereo"})
-"""Targets that compare the native core with Python: without it they compare nothing."""
+"""Targets that compare the native core with Python; they are skipped without the core."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -52,11 +52,11 @@ def _with_hypothesis(options: argparse.Namespace) -> int:
     if _lacks_core(options.target):
         return 0
     meter, run = Meter(), TARGETS[options.target]
-    inputs, last = 0, b""
+    inputs, last_input = 0, b""
 
     def one_input(data: bytes) -> None:
-        nonlocal inputs, last
-        inputs, last = inputs + 1, data
+        nonlocal inputs, last_input
+        inputs, last_input = inputs + 1, data
         run(data, meter)
 
     end, seed = time.monotonic() + options.seconds, options.seed
@@ -64,7 +64,7 @@ def _with_hypothesis(options: argparse.Namespace) -> int:
         try:
             run_damaged(options.target, one_input, first=seed, inputs=_INPUTS_PER_SEED)
         except Exception:  # noqa: BLE001  any error is a failure of the target
-            print(f"{options.target}: {_kept(options.found, last)} failed after {inputs} inputs")
+            print(f"{options.target}: {_write_input(options.found, last_input)} failed after {inputs} inputs")
             traceback.print_exc()
             return 1
         seed += 1
@@ -77,12 +77,12 @@ def _with_hypothesis(options: argparse.Namespace) -> int:
     if exceeded:
         print(f"  above the limits of {max_ms:g} ms and {max_mib:g} MiB: {json.dumps(exceeded)}")
         for data in (meter.slowest, meter.largest):
-            print(f"  {_kept(options.found, data)}")
+            print(f"  {_write_input(options.found, data)}")
     return 0
 
 
 def _lacks_core(target: str) -> bool:
-    """Return, having said so, whether *target* compares the native core and none can be loaded."""
+    """Return whether *target* needs the native core and the core cannot be loaded; print a line if so."""
     from rse_pf.native import find_library
 
     lacks = target in _OF_THE_CORE and find_library() is None
@@ -100,7 +100,7 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
-def _kept(folder: Path, data: bytes) -> Path:
+def _write_input(folder: Path, data: bytes) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / hashlib.sha256(data).hexdigest()[:16]
     file.write_bytes(data)
@@ -108,7 +108,7 @@ def _kept(folder: Path, data: bytes) -> Path:
 
 
 def _with_atheris(options: argparse.Namespace) -> None:
-    """Hand the process to libFuzzer, which ends it."""
+    """Run libFuzzer in this process, which libFuzzer exits."""
     import atheris
 
     with atheris.instrument_imports(include=["rse_pf"]):
@@ -121,7 +121,7 @@ def _with_atheris(options: argparse.Namespace) -> None:
     folder = options.found / f"{options.target}-corpus"
     folder.mkdir(parents=True, exist_ok=True)
     for data in samples(options.target):
-        _kept(folder, data)
+        _write_input(folder, data)
 
     def one_input(data: bytes) -> None:
         worst = meter.worst_ms
@@ -129,7 +129,7 @@ def _with_atheris(options: argparse.Namespace) -> None:
             run(data, meter)
         except Exception:
             # A libFuzzer that was loaded before Python ends without writing the input of an exception.
-            print(f"{options.target}: {_kept(options.found, data)} failed", file=sys.stderr)
+            print(f"{options.target}: {_write_input(options.found, data)} failed", file=sys.stderr)
             raise
         if meter.worst_ms > max(worst, 1.0):
             print(meter.line(), file=sys.stderr)

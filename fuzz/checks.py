@@ -1,4 +1,4 @@
-"""What all fuzz targets share: their type, and the error of a rule that the product violates."""
+"""The type of fuzz targets, and the error that a target raises when the product violates a rule."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The fuzz targets of the native core's front end, depth refinement and tracker: any numbers and sizes.
 
-Each calls the library through the Python binding, and directly, with rooms of exactly the size that the C ABI
-asks for.
+Each target calls the library through the Python binding, and directly with buffers of the smallest size that
+the C ABI allows.
 """
 
 from __future__ import annotations
@@ -33,33 +33,34 @@ from rse_pf.slam.tracking import (
 )
 from tests.oracles import depths, matching
 
-__all__ = ["HOSTILE_SIZES", "Room", "depth", "describe", "match", "track"]
+__all__ = ["HOSTILE_SIZES", "GuardedBuffer", "depth", "describe", "match", "track"]
 
 Anything = npt.NDArray[Any]
 
 _CAMERA = Camera(fx=300.0, fy=310.0, cx=3.5, cy=4.0, width=640, height=480)
-_HEAD = 8
+_HEAD = 8  # bytes at the start of an input that choose sizes and kinds; the others are the data
 HOSTILE_SIZES = (-1, -(2**63), 2**24 + 1, 2**31, 2**60, 2**63 - 1)
-_PATTERN, _BEHIND = 0xA5, 64
+_PATTERN = 0xA5  # value of each byte of the guard behind a buffer
+_GUARD_BYTES = 64  # size of that guard
 _LEVELS = 8  # of ORB's pyramid
-_STRANGE = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
+_SPECIAL_NUMBERS = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
 
 
 def match(data: bytes, meter: Meter) -> None:
-    """Compare matches and points with their definition, for all instructions that the library may use."""
+    """Compare matches and points with the oracle, for each instruction set that the library may use."""
     if len(data) < _HEAD:
         return
     n, m, part = data[0] % 48, data[1] % 48, data[3]
     body = data[_HEAD:]
     bits = _cut(np.resize(np.frombuffer(body or b"\0", np.uint8), (n + m) * 32), data[5])
     reference, view = bits[: n * 32].reshape(n, 32), bits[n * 32 :].reshape(m, 32)
-    ratio = _STRANGE[part % 5] if part > 250 else part / 128
+    ratio = _SPECIAL_NUMBERS[part % 5] if part > 250 else part / 128
     expected = matching.best_matches(reference, view, ratio)
     for lanes in ("avx512", "avx2", "portable"):
         found = meter.call(
             lambda _, lanes=lanes: match_orb(reference, view, ratio, lanes=lanes), data, ProtocolError
         )
-        expect(_all_equal(found, expected), "matches are not those of the definition")
+        expect(_all_equal(found, expected), "matches are not those of the oracle")
     _match_directly(np.array(reference), np.array(view), ratio, len(expected[0]))
     _points_at(data, _cut(_numbers(data[2], body, 2 * m), data[5]).reshape(m, 2))
 
@@ -67,18 +68,18 @@ def match(data: bytes, meter: Meter) -> None:
 def _match_directly(reference: Anything, view: Anything, ratio: float, count: int) -> None:
     matches = _function("match", "rse_pf_match")
     n, m = len(reference), len(view)
-    rooms = [Room(8 * words) for words in (n + 5 * m + 64, min(n, m), min(n, m))]
+    buffers = [GuardedBuffer(8 * words) for words in (n + 5 * m + 64, min(n, m), min(n, m))]
 
     def called(rows: int, view_rows: int) -> int:
         answer: int = matches(
-            address_of(reference), rows, address_of(view), view_rows, ratio, 0, *(each.at for each in rooms)
+            address_of(reference), rows, address_of(view), view_rows, ratio, 0, *(each.at for each in buffers)
         )
         return answer
 
-    expect(called(n, m) == count, "another number of matches without the binding")
+    expect(called(n, m) == count, "the library called directly returns another number of matches")
     for size in HOSTILE_SIZES:
         expect(called(size, m) == -1 and called(n, size) == -1, f"{size} rows are not refused")
-    for each in rooms:
+    for each in buffers:
         each.check()
 
 
@@ -97,20 +98,20 @@ def _points_at(data: bytes, pixels: Array) -> None:
     found = points_at(Frame(timestamp_s=0.0, rgb=rgb, depth_m=depth_m, camera=camera), pixels, options)
 
     expected = depths.points_at(depth_m, pixels, camera, 0.1, 4.0, options.depth_spread_percent / 100.0)
-    expect(_all_equal((found,), (expected,)), "points are not those of the definition")
+    expect(_all_equal((found,), (expected,)), "points are not those of the oracle")
     call, copies = _function("match", "rse_pf_points_at"), (np.array(depth_m), np.array(pixels))
-    room = Room(24 * len(pixels))
+    buffer = GuardedBuffer(24 * len(pixels))
     for wide, high, rows in ((size, 3, 1) for size in HOSTILE_SIZES):
         for sizes in ((wide, high, rows), (high, wide, rows), (width, height, wide)):
             answer = call(
-                address_of(copies[0]), *sizes[:2], address_of(copies[1]), sizes[2], *[1.0] * 7, room.at
+                address_of(copies[0]), *sizes[:2], address_of(copies[1]), sizes[2], *[1.0] * 7, buffer.at
             )
             expect(answer == -1, f"the sizes {sizes} are not refused")
-    room.check()
+    buffer.check()
 
 
 def depth(data: bytes, meter: Meter) -> None:
-    """Check that any numbers give equal, finite poses with all instructions, rigid ones if they began so."""
+    """Check that refined poses are finite, equal with and without AVX2, and rigid if the first pose is."""
     if len(data) < _HEAD:
         return
     n, k, kind = data[0] % 64, data[1] % 70, data[2]
@@ -124,7 +125,7 @@ def depth(data: bytes, meter: Meter) -> None:
         pixels = np.clip(np.nan_to_num(pixels), -900.0, 900.0)
     inliers = _cut(np.arange(k, dtype=np.int64) * (1 + data[7] % 5) - data[7] // 64, data[6])
     noise = DepthNoise(base_m=max(1e-5, data[3] / 1e4), growth_per_m=data[4] / 1e5, from_m=data[5] / 16.0)
-    rmse_px = _STRANGE[data[3] % 5] if data[7] == 255 else data[5] / 8.0
+    rmse_px = _SPECIAL_NUMBERS[data[3] % 5] if data[7] == 255 else data[5] / 8.0
     solution = PnpSolution(
         T_camera_world=T, inliers=inliers, rmse_px=rmse_px,
         covariance=np.eye(6), verdict="ok", reason="", engine="native",
@@ -144,7 +145,7 @@ def depth(data: bytes, meter: Meter) -> None:
         numbers = [(each.T_camera_world, each.covariance) for each in (first, second)]
         expect(_all_equal(*numbers), "AVX2 changes a refined pose")
     outside = k > n or bool(np.any((inliers < 0) | (inliers >= n)))
-    expect(not outside or first is None, "rows that are not there were refined")
+    expect(not outside or first is None, "inliers beyond the last row were refined")
     if first is not None and first is not solution:
         _check_refined(first, T)
     _refine_hostile_sizes(inliers, points)
@@ -170,7 +171,7 @@ def _refine_hostile_sizes(inliers: Anything, points: Array) -> None:
             request[1:3] = n, k
             request[3:7] = address_of(numbers), address_of(numbers), address_of(numbers), address_of(rows)
             request[7:15].view(np.float64)[:] = (300.0, 300.0, 1.0, 1.0, 1e-3, 0.0, 0.0, 1.0)
-            result, work = Room(8 * (2 + 16 + 36)), Room(8 * 11 * 5)
+            result, work = GuardedBuffer(8 * (2 + 16 + 36)), GuardedBuffer(8 * 11 * 5)
             refine(address_of(request), work.at, result.at)
             expect(result.first() == 2, f"{n} rows with {k} inliers are not refused")
             result.check()
@@ -178,14 +179,14 @@ def _refine_hostile_sizes(inliers: Anything, points: Array) -> None:
 
 
 def describe(data: bytes, meter: Meter) -> None:
-    """Check that any picture and keypoints give descriptors or None, and that nothing else is written.
+    """Check that any picture and keypoints give descriptors or None, and no write beyond a buffer.
 
-    So does a picture give keypoints, which lie within it.
+    Keypoints that are detected in the picture lie within it.
     """
     if len(data) < _HEAD:
         return
     height, width, n, levels, kind = data[0] % 180, data[1] % 180, data[2] % 32, data[4] % 40, data[5]
-    scale = _STRANGE[data[3] % 5] if data[3] > 250 else 1.0 + data[3] / 255
+    scale = _SPECIAL_NUMBERS[data[3] % 5] if data[3] > 250 else 1.0 + data[3] / 255
     body = data[_HEAD:] or b"\0"
     gray = _cut(np.resize(np.frombuffer(body, np.uint8), height * width), data[6]).reshape(height, width)
     numbers = _numbers(kind, body, 3 * n)
@@ -195,8 +196,8 @@ def describe(data: bytes, meter: Meter) -> None:
     if kind & 4 and 1.0 <= scale <= 2.0:  # most of them inside
         octaves = octaves % 4
         edge = np.repeat(23.0 * scale**octaves, 2).reshape(n, 2)
-        room = np.maximum((width, height) - 2.0 * edge, 1.0)
-        places = edge + np.fmod(np.abs(np.nan_to_num(pixels)).reshape(n, 2), room)
+        buffer = np.maximum((width, height) - 2.0 * edge, 1.0)
+        places = edge + np.fmod(np.abs(np.nan_to_num(pixels)).reshape(n, 2), buffer)
         pixels = places.astype(np.float32).ravel()
     pixels, angles_deg = _cut(pixels, data[6]).reshape(n, 2), _cut(angles_deg, data[6])
     octaves = _cut(octaves.astype(np.int32), data[6])
@@ -227,22 +228,22 @@ def _detect_directly(gray: Anything, n: int, scale: float, levels: int, threshol
     with np.errstate(over="ignore", invalid="ignore"):
         scales = np.float32(scale) ** np.arange(max(levels, 1), dtype=np.float32)
     wanted = np.full(max(levels, 1), n, dtype=np.int64)
-    work = Room(8 * (width * height // 2 + 8 * width + height + 64))
-    out = [Room(each * n) for each in (8, 4, 4, 4)]
+    work = GuardedBuffer(8 * (width * height // 2 + 8 * width + height + 64))
+    out = [GuardedBuffer(each * n) for each in (8, 4, 4, 4)]
 
-    def called(width: int, height: int, levels: int, threshold: int, room: int) -> int:
+    def called(width: int, height: int, levels: int, threshold: int, buffer: int) -> int:
         request = np.zeros(8, dtype=np.int64)
         request[:5] = address_of(gray), width, height, address_of(scales), address_of(wanted)
         request[5:6].view(np.int32)[:] = levels, threshold
-        request[6:] = room, work.at
+        request[6:] = buffer, work.at
         answer: int = call(address_of(request), *(each.at for each in out))
         return answer
 
-    expect(called(width, height, levels, threshold, n) <= n, "more keypoints than there is room")
+    expect(called(width, height, levels, threshold, n) <= n, "more keypoints than there is buffer")
     for size in HOSTILE_SIZES:
         for sides in ((size, 50), (50, size)):
             expect(called(*sides, 8, 7, n) == -1, f"sides {sides} are not refused")
-        expect(called(width, height, 8, 7, size) == -1, f"room for {size} is not refused")
+        expect(called(width, height, 8, 7, size) == -1, f"buffer for {size} is not refused")
     for bad in (-1, 0, 33, 2**31 - 1):
         expect(called(width, height, bad, 7, n) == -1, f"{bad} levels are not refused")
     for bad in (-1, 256, 2**31 - 1):
@@ -264,7 +265,7 @@ def _describe_directly(
     turned = np.nan_to_num(angles_deg.astype(np.float64))
     cosines, sines = np.cos(turned).astype(np.float32), np.sin(turned).astype(np.float32)
     scales = np.full(max(levels, 1), 1.0, np.float32) * np.float32(min(scale, 1e30))
-    work, out = Room(8 * (3 * width * height // 8 + 7 * width + 64)), Room(32 * n)
+    work, out = GuardedBuffer(8 * (3 * width * height // 8 + 7 * width + 64)), GuardedBuffer(32 * n)
 
     def called(width: int, height: int, levels: int, rows: int) -> int:
         answer: int = call(
@@ -284,7 +285,7 @@ def _describe_directly(
 
 
 def track(data: bytes, meter: Meter) -> None:
-    """Compare matches near pixels with their definition; any numbers give a finite pose or none."""
+    """Compare matches near predicted pixels with the oracle; any numbers give a finite pose or none."""
     if len(data) < _HEAD:
         return
     m, n, kind, how = data[0] % 48, data[1] % 48, data[2], data[6]
@@ -308,13 +309,13 @@ def track(data: bytes, meter: Meter) -> None:
             )
         )  # fmt: skip
     sought, image = sides
-    apart_px = _STRANGE[data[3] % 5] if data[3] > 250 else data[3] / 8.0
+    apart_px = _SPECIAL_NUMBERS[data[3] % 5] if data[3] > 250 else data[3] / 8.0
     distinct = meter.call(
         lambda _: measure_distinctiveness(image[3], image[0], apart_px), data, ProtocolError
     )
     expected_distinct = matching.measure_distinctiveness(image[3], image[0], apart_px)
     expect(np.array_equal(distinct, expected_distinct), "other distances")
-    ratio = _STRANGE[data[5] % 5] if data[5] > 250 else data[5] / 128
+    ratio = _SPECIAL_NUMBERS[data[5] % 5] if data[5] > 250 else data[5] / 128
     limits = GuidedMatchLimits(
         radius_px=min(10.0 ** (data[4] / 28.0) - 1.0, 1e9),
         lowe_ratio=ratio,
@@ -342,7 +343,7 @@ def track(data: bytes, meter: Meter) -> None:
         lambda _: match_predictions(sought_features, image_features, limits), data, ProtocolError
     )
     expected = matching.match_predictions(sought_features, image_features, limits)
-    expect(_all_equal(found, expected), "matches are not those of the definition")
+    expect(_all_equal(found, expected), "matches are not those of the oracle")
     _near_directly(sought, (*image, distinct), numbers_of, len(expected[0]))
     _fit(data, meter)
 
@@ -353,7 +354,11 @@ def _near_directly(
     near, distinct = _function("track", "rse_pf_match_near"), _function("track", "rse_pf_distinct")
     m, n, abi = len(sought[0]), len(image[0]), PART_ABIS["track"]
     arrays = [np.array(each) for each in (*sought, *image)]
-    rooms = Room(8 * (m + 12 * n + 16_400)), Room(8 * min(m, n)), Room(8 * min(m, n))
+    buffers = (
+        GuardedBuffer(8 * (m + 12 * n + 16_400)),
+        GuardedBuffer(8 * min(m, n)),
+        GuardedBuffer(8 * min(m, n)),
+    )
 
     def called(abi: int, sought_rows: int, rows: int, radius_px: float) -> int:
         request = np.zeros(2 + 1 + 9 + 5 + 1, dtype=np.int64)
@@ -362,19 +367,21 @@ def _near_directly(
         request[3:12] = [address_of(each) for each in arrays]
         request[12:17].view(np.float64)[:] = (radius_px, *limits[1:5])
         request[17] = limits[5]
-        answer: int = near(address_of(request), *(room.at for room in rooms))
+        answer: int = near(address_of(request), *(buffer.at for buffer in buffers))
         return answer
 
-    expect(called(abi, m, n, limits[0]) == count, "another number of matches without the binding")
+    expect(
+        called(abi, m, n, limits[0]) == count, "the library called directly returns another number of matches"
+    )
     expect(called(abi + 1, m, n, limits[0]) == -1, "another ABI is not refused")
     for size in HOSTILE_SIZES:
         expect(called(abi, size, n, 1.0) == called(abi, m, size, 1.0) == -1, f"{size} rows are not refused")
-        answer = distinct(address_of(arrays[7]), address_of(arrays[4]), size, 6.0, rooms[0].at)
+        answer = distinct(address_of(arrays[7]), address_of(arrays[4]), size, 6.0, buffers[0].at)
         expect(answer == -1, f"{size} rows have distances")
     for radius_px in (-1.0, float("nan"), float("inf")):
         expect(called(abi, m, n, radius_px) == -1, f"a radius of {radius_px} is not refused")
-    for room in rooms:
-        room.check()
+    for buffer in buffers:
+        buffer.check()
 
 
 def _fit(data: bytes, meter: Meter) -> None:
@@ -390,7 +397,7 @@ def _fit(data: bytes, meter: Meter) -> None:
         spreads = np.tile([1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4], n) * (1.0 + data[4])
         deviations, depths_dev_m = np.ones(n), np.full(n, 0.01)
     full = spreads.reshape(n, 6)[:, (0, 1, 2, 1, 3, 4, 2, 4, 5)].reshape(n, 3, 3)
-    cauchy = _STRANGE[data[5] % 5] if data[5] > 250 else 2.5
+    cauchy = _SPECIAL_NUMBERS[data[5] % 5] if data[5] > 250 else 2.5
     rows = points.reshape(n, 3), spreads.reshape(n, 6)
     measured = pixels.reshape(n, 2), deviations, depths_m, depths_dev_m
     observed = Observations(
@@ -407,7 +414,11 @@ def _fit(data: bytes, meter: Meter) -> None:
             pose[3].tolist() == [0.0, 0.0, 0.0, 1.0] and np.array_equal(information, information.T), "no pose"
         )
         expect(bool(found.is_inlier.sum() >= 3), "a pose of two points")
-    fit, is_in, result = _function("track", "rse_pf_fit_pose"), Room(n), Room(8 * (1 + 16 + 36))
+    fit, is_in, result = (
+        _function("track", "rse_pf_fit_pose"),
+        GuardedBuffer(n),
+        GuardedBuffer(8 * (1 + 16 + 36)),
+    )
     arrays = [np.array(each) for each in (*rows, *measured)]
     for size in HOSTILE_SIZES:
         request = np.zeros(2 + 6 + 6 + 16, dtype=np.int64)
@@ -420,23 +431,26 @@ def _fit(data: bytes, meter: Meter) -> None:
     result.check()
 
 
-class Room:
-    """Memory of exactly *size* bytes for the library, with a pattern behind it."""
+class GuardedBuffer:
+    """A buffer of *size* bytes for the library, followed by a pattern that the library must not change."""
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._bytes = np.full(size + _BEHIND, _PATTERN, dtype=np.uint8)
+        self._bytes = np.full(size + _GUARD_BYTES, _PATTERN, dtype=np.uint8)
         self.at = address_of(self._bytes)
 
     def check(self) -> None:
-        expect(bool((self._bytes[self._size :] == _PATTERN).all()), "the library wrote behind its room")
+        expect(
+            bool((self._bytes[self._size :] == _PATTERN).all()),
+            "the library wrote beyond the end of a buffer",
+        )
 
     def first(self) -> int:
         return int(self._bytes[:8].view(np.int64)[0])
 
 
 def _cut(array: Anything, how: int) -> Anything:
-    """Return the same numbers in memory that ends behind them; at an odd address if *how* is odd."""
+    """Return a copy of *array* at the end of its memory block; at an odd address if *how* is odd."""
     if not how % 2:
         return np.array(array)
     moved = np.frombuffer(b"\0" + array.tobytes(), np.uint8)[1:]
@@ -444,7 +458,7 @@ def _cut(array: Anything, how: int) -> Anything:
 
 
 def _numbers(kind: int, data: bytes, count: int) -> Array:
-    """Return *count* numbers of *data*: as they are, or small, or with strange ones among them."""
+    """Return *count* numbers made of *data*: unchanged, small, or with NaN, infinity and 1e300 among them."""
     data = data or b"\0"
     if kind % 4 in (0, 3):
         found = np.frombuffer((data + bytes(8))[: max(len(data) // 8 * 8, 8)], "<f8")
@@ -454,7 +468,7 @@ def _numbers(kind: int, data: bytes, count: int) -> Array:
         found = np.frombuffer(data, np.int8).astype(np.float64) * 0.37
     found = np.resize(found, count).astype(np.float64)
     if kind & 16:
-        found[kind % 7 :: 7] = np.resize(_STRANGE, len(found[kind % 7 :: 7]))
+        found[kind % 7 :: 7] = np.resize(_SPECIAL_NUMBERS, len(found[kind % 7 :: 7]))
     return found
 
 

@@ -1,4 +1,4 @@
-"""The fuzz target of a live map's keyframes: their bytes, and what computes with them.
+"""The fuzz target of a live map's keyframes: decoding them, and computing with their features.
 
 Keyframes are decoded in the process that owns the map, so their cost has the bars of a robot's message.
 """

@@ -1,4 +1,4 @@
-"""The fuzz targets of maps, keyframes, sandboxes' messages, pose graphs and point clouds.
+"""The fuzz targets of maps, keyframes, messages of sandboxes, pose graphs and point clouds.
 
 Maps and payloads of map services are computed in processes that may be killed; messages of a sandbox are
 read in the worker itself, so their cost has the bars of a robot's message.
@@ -34,7 +34,7 @@ _REGISTRY = builtin_services(_SETTINGS)
 _CODECS = tuple(make_codec(name, _SETTINGS.session) for name in ("bin", "json"))
 _MAGIC = b"RSEMAP1\n"
 _LONG_TEXT = 16_384
-"""Longer pose graphs are not optimised: time is better spent on other inputs."""
+"""Longest text of a pose graph in bytes, so that many graphs are tried in a second; the rest is ignored."""
 _CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 

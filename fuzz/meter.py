@@ -22,10 +22,10 @@ BARS = {
     "maps": (100.0, 64.0),
     "live": (MAX_MS, MAX_MIB),
 }
-"""Milliseconds and MiB of one input by target: those that a server reads for a stranger."""
+"""Limits of CPU time (ms) and memory (MiB) of one input, for the targets whose input a robot sends."""
 
 _TRACED_FROM_MS = 0.5
-"""Nothing takes two MiB in less."""
+"""Shortest CPU time of a call whose memory is measured: a shorter call cannot allocate 2 MiB."""
 _TRIES = 3
 
 

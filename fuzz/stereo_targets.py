@@ -10,7 +10,7 @@ import ctypes
 import numpy as np
 
 from fuzz.checks import expect
-from fuzz.core_targets import HOSTILE_SIZES, Room
+from fuzz.core_targets import HOSTILE_SIZES, GuardedBuffer
 from fuzz.meter import Meter
 from rse_pf.errors import ProtocolError
 from rse_pf.native import PART_ABIS, address_of, core_function
@@ -20,7 +20,7 @@ from tests.oracles import disparities as oracle
 __all__ = ["stereo"]
 
 _HEAD = 8
-_STRANGE = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
+_SPECIAL_NUMBERS = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
 
 
 def stereo(data: bytes, meter: Meter) -> None:
@@ -34,7 +34,7 @@ def stereo(data: bytes, meter: Meter) -> None:
     left = np.resize(body, height * width).reshape(height, width)
     right = np.roll(left, -shift, axis=1) ^ np.resize(body[::-1] >> (data[7] % 8), left.shape)
     where = np.resize(body[body.size // 2 :], 2 * n).astype(np.float64).reshape(n, 2)
-    where[1::7] = _STRANGE[limits % 5]
+    where[1::7] = _SPECIAL_NUMBERS[limits % 5]
     options = StereoOptions(
         min_disparity_px=min(0.25 + limits / 64, most), max_disparity_px=min(most, 1024),
         min_likeness=0.1 + limits / 300, uniqueness=0.5 + limits / 600, left_right_px=limits % 4 - 1,
@@ -55,7 +55,7 @@ def _directly(left: np.ndarray, right: np.ndarray, where: np.ndarray) -> None:  
     pointer = ctypes.c_void_p
     call = core_function("stereo", "rse_pf_disparities", (pointer, pointer), ctypes.c_int32)
     left, right, where = np.array(left), np.array(right), np.array(where)
-    room = Room(8 * len(where))
+    buffer = GuardedBuffer(8 * len(where))
     (height, width), abi = left.shape, PART_ABIS["stereo"]
 
     def called(abi: int, size: tuple[int, int, int], most: int) -> int:
@@ -63,7 +63,7 @@ def _directly(left: np.ndarray, right: np.ndarray, where: np.ndarray) -> None:  
             abi, 0, *size[:2], address_of(left), address_of(right), size[2], address_of(where),
             1.0, 0.5, 0.8, most, 1,
         )  # fmt: skip
-        answer: int = call(ctypes.addressof(request), room.at)
+        answer: int = call(ctypes.addressof(request), buffer.at)
         return answer
 
     expect(called(abi, (width, height, len(where)), 8) == 0, "a pair was refused")
@@ -72,4 +72,4 @@ def _directly(left: np.ndarray, right: np.ndarray, where: np.ndarray) -> None:  
         for sizes in ((size, height, 1), (width, size, 1), (width, height, size)):
             expect(called(abi, sizes, 8) == -1, f"the sizes {sizes} are not refused")
         expect(called(abi, (width, height, len(where)), size) == -1, f"disparities to {size} are not refused")
-    room.check()
+    buffer.check()

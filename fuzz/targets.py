@@ -49,7 +49,7 @@ _ENCODERS = {
     "json": msgspec.json.Encoder(enc_hook=json_encode_hook).encode,
 }
 _SHORT = 8192
-"""Longer payloads are not tried on every service: time is better spent on other inputs."""
+"""Longest message whose payload is tried on every service, in bytes, so that many inputs are tried."""
 _REGISTRY = builtin_services(PLATFORM)
 _MADE = {
     name: make_server_codec(name, PLATFORM.session, read_first=pnp_reader(_REGISTRY, name)) for name in CODECS
@@ -87,15 +87,15 @@ def codec(data: bytes, meter: Meter) -> None:
 
 
 def _compare_with_robots(chosen: Codec, data: bytes) -> None:
-    """Check that *chosen* reads and refuses a command as the codec of a robot does."""
+    """Check that the server's codec *chosen* decodes and refuses the same messages as the robot's codec."""
     got, expected = (_outcome(each, data) for each in (chosen, _OF_ROBOTS[chosen.name]))
     if chosen.name == "zlib" and (got[0] == "zlib" or expected[0] == "zlib"):
         return  # isal ignores the size of the window in the head, which no part of the stream needs
-    expect(got == expected, "a message is read in another way than by the codec of a robot")
+    expect(got == expected, "server and robot decode a message differently")
 
 
 def _outcome(chosen: Codec, data: bytes) -> tuple[str, bytes]:
-    """Return what *chosen* makes of *data*: an error's code, or ``read`` and the message with its request."""
+    """Decode *data*; return the code of the error, or ``read`` and the message with its request, encoded."""
     try:
         message = chosen.decode_from_robot(data)
         if isinstance(message, Command) and message.service == "pnp":
