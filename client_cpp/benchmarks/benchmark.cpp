@@ -1,7 +1,7 @@
-// What the client costs: CPU time of a command, round trips of poses and echoes, memory over time.
+// Measure the client: CPU time of a command, round trips of poses and echoes, and memory over time.
 //
-// Arguments: address, token, and `pace` (commands a second, 0: as fast as the limits allow), number of poses, seconds
-// of the memory test. Prints JSON. CPU time is that of this process, all threads; memory is that of the allocator.
+// Arguments: address, token, PACE (commands a second; 0: as many as the limits allow), number of poses, and duration of
+// the memory test in seconds. Prints JSON. CPU time is of all threads of this process; memory is that of the allocator.
 #include <algorithm>
 #include <condition_variable>
 #include <cstdio>
@@ -22,7 +22,7 @@ double cpu_s() {
     return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
 }
 
-/// 300 points in front of the camera, pixels with noise of half a pixel.
+/// Return 300 points in front of the camera, with noise of 0.5 px (standard deviation) in their pixels.
 rse_pf::PnpRequest problem(std::mt19937& random) {
     std::uniform_real_distribution<double> place(-1, 1);
     std::normal_distribution<double> noise(0, 0.5);
@@ -42,7 +42,7 @@ rse_pf::json percentiles(std::vector<double> values) {
     return {{"n", values.size()}, {"p50", at(0.5)}, {"p95", at(0.95)}, {"p99", at(0.99)}};
 }
 
-/// CPU time of a command without a network: encode, and decode the answer.
+/// Return the CPU time of one call of *work*, in microseconds: the mean of *n* calls.
 template <class Work> double each_us(int n, Work work) {
     const double begin = cpu_s();
     for (int i = 0; i < n; ++i) work();

@@ -1,4 +1,4 @@
-// Checks of a test program: each prints what does not hold, and the program then ends with 1.
+// Checks of a test program: a failed check prints its text, and the program then exits with 1.
 #pragma once
 
 #include <cstdio>

@@ -1,4 +1,4 @@
-// The client against servers that refuse, say nothing or speak something else, and its calls from many threads.
+// The client with servers that refuse it, are silent or speak another protocol, and with calls from many threads.
 #include <rse_pf/rse_pf.hpp>
 
 #include "check.hpp"
@@ -258,7 +258,7 @@ void callbacks_neither_hold_up_nor_end_the_connection() {
         robot.close();
         over.set_value();
     });
-    expect(ends_soon(is_over), "a callback closes its client");
+    expect(ends_soon(is_over), "a callback closes its robot");
     expect(server.commands == 3, "nothing was sent twice");
     expect_error("disconnected", [&] { robot.call("echo", 4).get(); }, "a call after the end");
 }

@@ -1,4 +1,4 @@
-// The rules of a session and the codec, without a socket: times are arguments.
+// The rules of a session and the codec, without a socket and without waiting: times are arguments.
 #include <random>
 #include <vector>
 
@@ -9,7 +9,7 @@
 
 using namespace rse_pf;
 using detail::Command;
-using detail::Heard;
+using detail::ServerRequest;
 using detail::Link;
 using detail::Session;
 
@@ -19,7 +19,7 @@ using LinkPtr = std::shared_ptr<Link>;
 
 std::string bytes_of(const json& message) { return encoded(message); }
 
-/// A session with a connection whose server said *limits*; ends are noted by id.
+/// A session with one connection of given *limits*; records how each command ended, by its id.
 struct Bench {
     Session session{{}, "test"};
     LinkPtr link;
@@ -34,7 +34,7 @@ struct Bench {
         session.adopt(fresh, now);
         return fresh;
     }
-    Heard hear(const LinkPtr& from, const json& message, double now) { return session.receive(from, bytes_of(message), now); }
+    ServerRequest hear(const LinkPtr& from, const json& message, double now) { return session.receive(from, bytes_of(message), now); }
     std::uint64_t send(double now, CallOptions options = {}) {
         const auto id = next++;
         session.submit({id, "echo", encoded({{"value", 1}}), std::move(options), [this, id](Outcome<Answer> outcome) {
@@ -104,7 +104,7 @@ void a_move_leaves_the_outstanding_where_they_are() {
     const auto id = bench.send(0);
     const auto old = bench.link;
     bench.said(old);
-    expect(bench.hear(old, {{"type", "move"}, {"reason", "drain"}, {"within_ms", 5000}}, 0.1).what == Heard::move, "a move");
+    expect(bench.hear(old, {{"type", "move"}, {"reason", "drain"}, {"within_ms", 5000}}, 0.1).kind == ServerRequest::move, "a move");
     const auto fresh = bench.welcomed("server-2", 0.2);
     expect(old->leaving && bench.said(fresh).empty() && bench.session.unanswered_on(old) == 1, "not sent again");
     bench.hear(old, result(id), 0.3);
@@ -123,7 +123,7 @@ void deadlines_end_commands_and_busy_ones_wait() {
     bench.said(bench.link);
     bench.hear(bench.link, {{"type", "failure"}, {"id", busy}, {"code", "busy"}, {"message", "m"}, {"retry_after_ms", 200}}, 1.1);
     bench.session.due(1.2);
-    expect(bench.said(bench.link).empty() && bench.ends[busy].empty(), "waits as long as it was told");
+    expect(bench.said(bench.link).empty() && bench.ends[busy].empty(), "waits as long as retry_after_ms says");
     bench.session.due(1.31);
     expect(bench.said(bench.link).size() == 1, "then it is sent again");
     short_one.deadline_s = -1;
@@ -186,11 +186,11 @@ void a_frame_that_a_pause_outlasts_ends_at_once() {
     const auto first = bench.send(0, options);
     bench.said(bench.link);
     bench.hear(bench.link, busy(first, 3000), 0.1);
-    Failure told;
+    Failure failure;
     options.trace = "t";
-    bench.session.submit({99, "echo", encoded({{"value", 1}}), options, [&](Outcome<Answer> outcome) { told = outcome.failure(); }}, 0.2);
-    expect(told.code == "busy" && told.message == "m" && told.trace == "t", "by the answer of the server");
-    expect(std::abs(told.retry_after_ms.value_or(0) - 2900) < 1, "with the time that is left");
+    bench.session.submit({99, "echo", encoded({{"value", 1}}), options, [&](Outcome<Answer> outcome) { failure = outcome.failure(); }}, 0.2);
+    expect(failure.code == "busy" && failure.message == "m" && failure.trace == "t", "by the answer of the server");
+    expect(std::abs(failure.retry_after_ms.value_or(0) - 2900) < 1, "with the time that is left");
     expect(bench.session.unanswered() == 0 && bench.said(bench.link).empty(), "and is not sent");
     options.deadline_s = 4;
     const auto patient = bench.send(0.3, options);

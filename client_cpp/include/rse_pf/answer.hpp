@@ -1,4 +1,4 @@
-// What a call is given and what it returns.
+// The options of a call and its answer.
 #pragma once
 
 #include <cstdint>
@@ -18,28 +18,29 @@ namespace rse_pf {
 
 using json = nlohmann::json;
 
-/// How one command is sent.
+/// Options of one command.
 struct CallOptions {
     /// Seconds within which the answer is needed; without it `Options::answer_timeout_s`, or none for a long service.
     std::optional<double> deadline_s{};
     /// Name of the camera or task; within a stream the newest command wins. Empty: no stream.
     std::string stream{};
-    /// Answer this command of the stream even if newer ones follow.
+    /// Whether this command is answered although newer commands of its stream follow.
     bool keep = false;
+    /// Word of at most 64 characters that the log of the server has beside this command.
     std::string trace{};
-    /// Called with the share that is done (0 to 1) and the last step of a long service, on the thread of callbacks.
+    /// Called on the thread of callbacks with the progress of a long service: the part that is done (0 to 1) and its step.
     std::function<void(double, const std::string&)> on_progress{};
 };
 
 /// The result of a command.
 struct Answer {
     std::uint64_t id = 0;
-    std::string reply_msgpack{};  ///< the reply as it came, in MessagePack; empty: null
+    std::string reply_msgpack{};  ///< the undecoded reply, in MessagePack; empty: null
     std::string object{};         ///< digest of a reply that is stored as an object; `reply()` is then null
     std::string server{};
     double queue_ms = 0, compute_ms = 0;
     double round_trip_ms = 0;  ///< from the call to the answer
-    /// One-way delays, known when the clocks of robot and server were compared.
+    /// Delays from robot to server and back; without a value until the offset of their clocks is known.
     std::optional<double> up_ms{}, down_ms{};
 
     /// Return the reply as JSON; arrays are binary values, see `numbers`. Throws RsePfError `bad-message`.
@@ -63,7 +64,7 @@ template <class T> struct Call {
 
 template <class T> using OnEnd = std::function<void(Outcome<T>)>;
 
-/// Return numbers as a payload holds them: an array of float64.
+/// Return *values* as a value of a payload: an array of float64.
 inline json array(const std::vector<double>& values) {
     std::string out;
     msgpack::Writer(out).doubles(values.data(), values.size());

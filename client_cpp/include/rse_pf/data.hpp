@@ -1,4 +1,4 @@
-// Objects of the data service: bytes by their sha256 digest, over HTTP. Calls wait; a client is used by one thread.
+// Objects of the data service: bytes by their sha256 digest, over HTTP. Calls block; use a client in one thread only.
 #pragma once
 
 #include <algorithm>
@@ -30,9 +30,9 @@ inline std::string sha256(std::string_view bytes) {
 }
 
 struct DataOptions {
-    std::string ca_file{};       ///< authorities to trust, in PEM; empty: the machine's
-    double timeout_s = 10;       ///< of one request
-    double deadline_s = 60;      ///< of a call, with everything that is repeated
+    std::string ca_file{};       ///< file of trusted authorities in PEM; empty: those of the machine
+    double timeout_s = 10;       ///< longest duration of one request
+    double deadline_s = 60;      ///< longest duration of a call, with its repeated requests
     std::size_t part_bytes = 1 << 20, max_object_bytes = 256 << 20;
 };
 
@@ -69,7 +69,7 @@ class DataClient {
     /// Return the object of *digest*; throws RsePfError `not-found`, or `store` if the bytes are not those of the digest.
     std::string download(const std::string& digest) {
         std::string bytes = request(Verb::get, "/data/v1/objects/" + digest, {});
-        if (sha256(bytes) != digest) throw RsePfError("store", "the bytes do not match the digest", "fetch it again");
+        if (sha256(bytes) != digest) throw RsePfError("store", "the bytes do not match the digest", "download the object again");
         return bytes;
     }
 
@@ -85,14 +85,14 @@ class DataClient {
     };
 
     static Upload upload_of(const std::string& body) {
-        const auto told = nlohmann::json::parse(body, nullptr, false);
-        if (!told.is_object() || !told.contains("offset") || !told["offset"].is_number_unsigned()) {
-            throw RsePfError("bad-message", "the data service answered something else than an upload");
+        const auto state = nlohmann::json::parse(body, nullptr, false);
+        if (!state.is_object() || !state.contains("offset") || !state["offset"].is_number_unsigned()) {
+            throw RsePfError("bad-message", "the answer of the data service does not hold the offset of an upload");
         }
-        return {told["offset"].get<std::size_t>(), told.value("part_bytes", std::size_t{1} << 20)};
+        return {state["offset"].get<std::size_t>(), state.value("part_bytes", std::size_t{1} << 20)};
     }
 
-    /// Repeat a request until it succeeds or is refused; every request of this class may be repeated.
+    /// Repeat a request until it succeeds or is refused; all requests of this class are idempotent.
     std::string request(Verb method, const std::string& path, std::string_view body, const Header& header = {}) {
         const double begin = detail::now_s();
         for (double pause = 0.1;; pause = std::min(5.0, 2 * pause)) {
@@ -106,11 +106,11 @@ class DataClient {
             if (broken) {
                 failure = {"connect", "no answer from " + address_.shown() + ": " + detail::cause_of(broken), "call again to resume"};
             } else {
-                auto told = detail::refused(address_.shown(), status, std::string(response[detail::http::field::retry_after]), response.body());
-                if (status == 404 && told.failure.code == "unsupported") told.failure.code = "not-found";
-                if (status != 429 && status != 502 && status != 503 && status != 504) throw RsePfError(told.failure);
-                failure = std::move(told.failure);
-                after = told.after_s;
+                auto refusal = detail::refused(address_.shown(), status, std::string(response[detail::http::field::retry_after]), response.body());
+                if (status == 404 && refusal.failure.code == "unsupported") refusal.failure.code = "not-found";
+                if (status != 429 && status != 502 && status != 503 && status != 504) throw RsePfError(refusal.failure);
+                failure = std::move(refusal.failure);
+                after = refusal.after_s;
             }
             const double wait = std::max(after, pause * std::uniform_real_distribution<double>(0.5, 1)(random_));
             if (detail::now_s() - begin + wait > options_.deadline_s) throw RsePfError(failure);

@@ -1,4 +1,4 @@
-// Failures: what the server, the network or this client could not do, as values and as one exception class.
+// Failures of the server, the network and this client: as values, and as one exception class.
 #pragma once
 
 #include <optional>
@@ -9,7 +9,7 @@
 
 namespace rse_pf {
 
-/// A command or a connection that ended without a result. `code` is one of section 5 of docs/protocol.md.
+/// Why a command or a connection ended without a result. `code` is a code of section 5 of docs/protocol.md.
 struct Failure {
     std::string code;
     std::string message;
@@ -36,7 +36,7 @@ class RsePfError : public std::runtime_error {
     Failure failure_;
 };
 
-/// Either a value or a `Failure`: what a callback is given, since no exception reaches or leaves it.
+/// A value or a `Failure`: the argument of callbacks, since exceptions do not reach them.
 template <class T> class Outcome {
   public:
     Outcome(T value) : state_(std::move(value)) {}

@@ -11,7 +11,7 @@
 
 namespace rse_pf::detail {
 
-/// What a server's Welcome allows.
+/// Limits in a server's Welcome.
 struct Limits {
     std::size_t max_message_bytes = 262144;
     std::size_t max_in_flight = 8;
@@ -19,7 +19,7 @@ struct Limits {
     double command_burst = 0;
 };
 
-/// A message of the server; which fields count depends on `type`.
+/// A message of the server; `type` decides which fields are set.
 struct ServerMessage {
     std::string_view type, server, session, robot, code, message, hint, trace, topic, key, object, what, reason;
     std::optional<std::uint64_t> id;
@@ -113,8 +113,8 @@ inline std::string renew(std::string_view token) {
     return out;
 }
 
-/// Return a message that has an id only: `cancel` or `unsubscribe`.
-inline std::string about(std::string_view type, std::uint64_t id) {
+/// Return a message whose only field is an id: `cancel` or `unsubscribe`.
+inline std::string message_with_id(std::string_view type, std::uint64_t id) {
     std::string out;
     msgpack::Writer(out).map(2).text("type").text(type).text("id").integer(id);
     return out;

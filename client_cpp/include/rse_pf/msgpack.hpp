@@ -2,7 +2,7 @@
 //
 // nlohmann-json reads and writes MessagePack, too, and is used for payloads of any shape. The messages around them, and
 // the arrays of `pnp`, are written and read here without a tree of objects. The reader bounds nesting and checks every
-// length, so that bytes of a stranger cannot exhaust the stack.
+// length, so that malformed input cannot exhaust the stack.
 #pragma once
 
 #include <cmath>
@@ -46,7 +46,7 @@ class Writer {
     }
     Writer& boolean(bool value) { return byte(value ? 0xc3 : 0xc2); }
     Writer& nil() { return byte(0xc0); }
-    /// Append what is MessagePack already.
+    /// Append a value that is already encoded.
     Writer& raw(std::string_view encoded) {
         out_.append(encoded);
         return *this;
@@ -94,7 +94,7 @@ class Writer {
     std::string& out_;
 };
 
-/// Read MessagePack; every method throws RsePfError `bad-message` when the bytes are something else.
+/// Read MessagePack; a method throws RsePfError `bad-message` if the next value is not of its type.
 class Reader {
   public:
     explicit Reader(std::string_view data) : at_(data.data()), end_(data.data() + data.size()) {}
@@ -179,10 +179,10 @@ class Reader {
 
   private:
     static RsePfError wrong(const char* expected) {
-        return {"bad-message", std::string("the message does not hold ") + expected + " where the protocol has one"};
+        return {"bad-message", std::string("the message does not have ") + expected + " where the protocol requires it"};
     }
     unsigned peek() const {
-        if (at_ == end_) throw wrong("everything it announces");
+        if (at_ == end_) throw wrong("as many bytes as its lengths state");
         return static_cast<unsigned char>(*at_);
     }
     unsigned take() {
@@ -191,7 +191,7 @@ class Reader {
         return tag;
     }
     std::string_view bytes(std::size_t n) {
-        if (n > static_cast<std::size_t>(end_ - at_)) throw wrong("everything it announces");
+        if (n > static_cast<std::size_t>(end_ - at_)) throw wrong("as many bytes as its lengths state");
         const std::string_view view(at_, n);
         at_ += n;
         return view;
@@ -214,7 +214,7 @@ class Reader {
         return value;
     }
     void skip(int levels) {
-        if (levels == 0) throw wrong("few enough levels");
+        if (levels == 0) throw wrong("at most 32 nested levels");
         const unsigned tag = peek();
         if ((tag & 0xf0) == 0x80 || tag == 0xde || tag == 0xdf) {
             for (std::uint64_t n = 2 * static_cast<std::uint64_t>(map()); n > 0; --n) skip(levels - 1);

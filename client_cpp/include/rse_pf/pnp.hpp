@@ -18,7 +18,7 @@ struct Camera {
     std::uint32_t width = 0, height = 0;    // px
 };
 
-/// Settings of RANSAC; what is empty is the server's choice.
+/// Settings of RANSAC; the server chooses each setting without a value.
 struct PnpOptions {
     std::string engine{};  ///< `native` or `opencv`
     std::optional<double> inlier_px{}, confidence{};
@@ -50,7 +50,7 @@ struct PoseAnswer {
     /// Upper triangle of the 6x6 covariance of the twist (metres, then radians) on the left of the pose.
     std::array<double, 21> covariance{};
     std::string verdict{};  ///< `ok` or `weak`
-    std::string reason{};   ///< why it is weak
+    std::string reason{};   ///< why the verdict is `weak`
     std::string engine{};
     double queue_ms = 0, compute_ms = 0, round_trip_ms = 0;
     std::string server{};
@@ -58,7 +58,7 @@ struct PoseAnswer {
     bool ok() const { return verdict == "ok"; }
 };
 
-/// Return the request in MessagePack; throws RsePfError `usage` if it has not as many pixels (or depths) as points.
+/// Return the request in MessagePack; throws RsePfError `usage` unless points, pixels and depths (if any) are equally many.
 inline std::string encoded(const PnpRequest& request) {
     const std::size_t n = request.points_world.size();
     if (request.pixels.size() != n || (!request.depths_m.empty() && request.depths_m.size() != n)) {

@@ -1,7 +1,7 @@
 // A robot's connection to the platform: commands, poses, subscriptions; safe to call from any thread.
 //
-// A client has two threads: of its connection and of its callbacks. A callback may call every method, wait for the future
-// of a call, and take its time: only other callbacks wait for it. What it throws ends there and is counted in `Stats`.
+// A robot has two threads: one for its connection, and one for the callbacks of the program. A callback may call every
+// method and wait for the future of a call; while it runs, only other callbacks wait. `Stats` counts its exceptions.
 #pragma once
 
 #include <atomic>
@@ -28,16 +28,16 @@ class Robot {
     Robot(const Robot&) = delete;
     Robot& operator=(const Robot&) = delete;
 
-    /// Connect and wait until a server answered; throws RsePfError if none does, or if it refuses. Call it once. A client that
-    /// was connected once connects again for ever, whatever its servers say; while they refuse it, calls end with the reason.
+    /// Connect and wait for the first Welcome; throws RsePfError if no server answers or the servers refuse the robot. Call it
+    /// once. A robot that was connected once reconnects for ever; while its servers refuse it, calls end with the reason.
     void connect() {
-        if (core_->started.exchange(true)) throw RsePfError("usage", "connect was called twice", "make another client");
+        if (core_->started.exchange(true)) throw RsePfError("usage", "connect was called twice", "make another Robot");
         auto opened = std::make_shared<std::promise<std::optional<Failure>>>();
         auto result = opened->get_future();
         const bool posted = post([core = core_, opened] {
             core->connection->open([opened](std::optional<Failure> failure) { opened->set_value(std::move(failure)); });
         });
-        if (!posted) throw RsePfError("disconnected", "the client was closed", "make another client");
+        if (!posted) throw RsePfError("disconnected", "the robot was closed", "make another Robot");
         {
             const std::lock_guard one_at_a_time(core_->posting);
             thread_ = std::thread([core = core_] {
@@ -52,13 +52,13 @@ class Robot {
         }
     }
 
-    /// Close the connection; unanswered commands end as `disconnected`. A destructor does the same. It returns after all
-    /// callbacks, unless a callback calls it; any thread may call it, and again.
+    /// Close the connection; unanswered commands end as `disconnected`. The destructor does the same. Any thread may call it,
+    /// also repeatedly. It returns after the last callback has returned, unless a callback calls it.
     void close() {
         std::thread connection, callbacks;
         {
             const std::lock_guard one_at_a_time(core_->posting);
-            if (!core_->closed.exchange(true) && core_->started) {  // what was posted before is answered; nothing is posted after it
+            if (!core_->closed.exchange(true) && core_->started) {  // earlier posts run before this one, and there are no later ones
                 boost::asio::post(core_->connection->io, [core = core_] {
                     core->connection->shut({"disconnected", "the robot closed its connection"});
                     core->guard.reset();
@@ -70,7 +70,7 @@ class Robot {
         if (!connection.joinable()) return callbacks_->wait();
         connection.join();
         callbacks_->end();
-        if (callbacks.get_id() == std::this_thread::get_id()) callbacks.detach();  // it keeps what it needs until it has ended
+        if (callbacks.get_id() == std::this_thread::get_id()) callbacks.detach();  // the thread shares the queue of callbacks until it ends
         else callbacks.join();
     }
 
@@ -81,17 +81,17 @@ class Robot {
         const auto id = submit(service, encoded(payload), std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, std::move(outcome)); });
         return {id, std::move(result)};
     }
-    /// Send a command; *on_end* is called once, on the thread of callbacks, or before this returns if `connect` was not
-    /// called or the client was closed. Returns the command's id.
+    /// Send a command and return its id; *on_end* is called once, on the thread of callbacks. If `connect` was not called, or
+    /// the robot was closed, *on_end* is called before this method returns.
     std::uint64_t call(const std::string& service, const json& payload, CallOptions options, OnEnd<Answer> on_end) {
         return send(service, encoded(payload), std::move(options), std::move(on_end));
     }
-    /// The same with a payload that is MessagePack already.
+    /// Send a command, as `call` does, whose payload is already MessagePack.
     std::uint64_t send(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end) {
         return submit(service, std::move(payload), std::move(options), detail::deferred(callbacks_, on_end), on_end);
     }
 
-    /// Estimate the pose of one image. In a stream (here `pose`) the newest image wins.
+    /// Estimate the pose of one image. By default the command is in the stream `pose`, of which the newest image wins.
     Call<PoseAnswer> solve_pnp(const PnpRequest& request, CallOptions options = in_stream("pose")) {
         auto promise = std::make_shared<std::promise<PoseAnswer>>();
         auto result = promise->get_future();
@@ -104,7 +104,7 @@ class Robot {
         });
     }
 
-    /// Give up a command: it ends as `cancelled`, and a long one is cancelled at the server, too.
+    /// Cancel a command: it ends as `cancelled`; the server is asked to cancel a long one, too.
     void cancel(std::uint64_t id) {
         post([core = core_, id] {
             core->connection->session.cancel(id);
@@ -112,16 +112,16 @@ class Robot {
         });
     }
 
-    /// Ask for the updates of *topic*, such as `live/MAP`, on this connection and all later ones; returns an id.
-    /// *on_update* gets the present value of every key, and then newer ones: a newer one replaces one that still waits for
-    /// the thread of callbacks.
+    /// Subscribe to *topic*, such as `live/MAP`, on this connection and all later ones; returns an id for `unsubscribe`.
+    /// *on_update* receives the present value of every key, and newer values later. While a value waits for the thread of
+    /// callbacks, a newer value of its key replaces it.
     std::uint64_t subscribe(const std::string& topic, OnUpdate on_update, OnSubscriptionEnd on_end = {}) {
         const std::uint64_t id = core_->next_id++;
         on_update = detail::newest(callbacks_, std::move(on_update), id, [](const std::string& key, const json&) { return key; });
         post([core = core_, id, topic, on_update = std::move(on_update), on_end = detail::deferred(callbacks_, std::move(on_end))] {
             auto& connection = *core->connection;
             if (connection.fatal) {
-                connection.session.tell(on_end, *connection.fatal);
+                connection.session.notify(on_end, *connection.fatal);
                 return;
             }
             connection.session.subscribe(id, topic, on_update, on_end, detail::now_s());
@@ -136,12 +136,12 @@ class Robot {
         });
     }
 
-    /// Use *token* from now on: on this connection, which then lives as long as the token, and on later ones.
+    /// Use *token* on later connections, and renew this connection, which then stays open as long as *token* is valid.
     void renew(const std::string& token) {
         post([core = core_, token] { core->connection->use_token(token); });
     }
 
-    /// Return the counts so far.
+    /// Return the counters since the robot was made.
     Stats stats() const {
         const auto read = [core = core_, callbacks = callbacks_] {
             Stats stats = core->connection->session.stats;
@@ -189,7 +189,7 @@ class Robot {
         return options;
     }
 
-    /// Send a command; *on_end* is called on the connection's thread, or *at_once* here if the client does not run.
+    /// Send a command. *on_end* is called on the thread of the connection; without one, *at_once* is called on this thread.
     std::uint64_t submit(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end, OnEnd<Answer> at_once = {}) {
         if (!at_once) at_once = on_end;
         const std::uint64_t id = core_->next_id++;
@@ -204,11 +204,11 @@ class Robot {
             connection.session.submit(std::move(*command), detail::now_s());
             connection.pump();
         });
-        if (!posted && at_once) callbacks_->call([&at_once] { at_once(Failure{"disconnected", "the client is not connected", "call connect first"}); });
+        if (!posted && at_once) callbacks_->call([&at_once] { at_once(Failure{"disconnected", "the robot is not connected", "call connect first"}); });
         return id;
     }
 
-    /// Let the client's thread do *work*; returns false if the client was closed, and nothing is done.
+    /// Run *work* on the thread of the connection; return false, without running it, if the robot was closed.
     template <class Work> bool post(Work&& work) const {
         const std::lock_guard one_at_a_time(core_->posting);
         if (core_->closed) return false;

@@ -1,4 +1,4 @@
-// Everything of the client; a program includes this file and links OpenSSL and a library of threads.
+// All headers of the client. A program that includes this file links OpenSSL and a library of threads.
 #pragma once
 
 #include "robot.hpp"

@@ -16,19 +16,20 @@
 
 namespace rse_pf::detail {
 
-/// A queue of callbacks: `run` calls them in their order on one thread; what they throw ends there and is counted.
+/// A queue of callbacks: `run` calls them in their order on one thread, and catches and counts their exceptions.
 class Callbacks {
   public:
-    /// Values of which the newest is enough: id of a subscription and key of its updates; id of a command, for progress.
+    /// Identifies values of which only the newest is needed: the id of a subscription and the key of an update, or the id of a
+    /// command with progress.
     using Key = std::pair<std::uint64_t, std::string>;
 
-    /// Let `run` call *callback*, in place of the one with the same *key* if that still waits.
+    /// Append *callback* to the queue, or replace the queued callback with the same *key*.
     void add(std::function<void()> callback, std::optional<Key> key = {}) {
         const std::lock_guard lock(mutex_);
         if (key) {
             auto& waits = newest_[*key];
             if (waits) {
-                waits->swap(callback);  // what the older one captured ends without the lock
+                waits->swap(callback);  // the older callback is destroyed after the lock
                 return;
             }
             waits = &waiting_.emplace_back(std::move(callback), std::move(key)).first;
@@ -37,13 +38,13 @@ class Callbacks {
         }
         changed_.notify_all();
     }
-    /// Let `run` return after the callbacks that wait.
+    /// Make `run` return after the queued callbacks.
     void end() {
         const std::lock_guard lock(mutex_);
         is_ending_ = true;
         changed_.notify_all();
     }
-    /// Wait until `run` has returned; in a callback, do not.
+    /// Wait until `run` has returned; return at once if a callback calls this.
     void wait() {
         std::unique_lock lock(mutex_);
         if (thread_ != std::this_thread::get_id()) changed_.wait(lock, [this] { return thread_ == std::thread::id(); });
@@ -59,7 +60,7 @@ class Callbacks {
             if (key) newest_.erase(*key);
             lock.unlock();
             call(callback);
-            callback = nullptr;  // what it captured ends without the lock, too
+            callback = nullptr;  // destroy it without the lock, too
             lock.lock();
         }
         thread_ = {};
@@ -95,7 +96,7 @@ class Callbacks {
     bool is_ending_ = false;
 };
 
-/// Return a function that lets *callbacks* call *callback* later; empty if *callback* is.
+/// Return a function that queues *callback* in *callbacks*; an empty function if *callback* is empty.
 template <class... Arguments>
 std::function<void(Arguments...)> deferred(const std::shared_ptr<Callbacks>& callbacks, std::function<void(Arguments...)> callback) {
     if (!callback) return {};
@@ -104,7 +105,7 @@ std::function<void(Arguments...)> deferred(const std::shared_ptr<Callbacks>& cal
     };
 }
 
-/// The same for values of which the newest is enough: *key_of* returns their key, within *id*.
+/// Return the same for values of which only the newest is needed; *key_of* returns the key of a value within *id*.
 template <class KeyOf, class... Arguments>
 std::function<void(Arguments...)> newest(const std::shared_ptr<Callbacks>& callbacks, std::function<void(Arguments...)> callback, std::uint64_t id, KeyOf key_of) {
     if (!callback) return {};

@@ -1,4 +1,4 @@
-// The sockets of a client: connect, read, write, reconnect, move; `Session` holds the rules. One thread calls it.
+// The sockets of a robot: connect, read, write, reconnect, move. `Session` holds the rules. Only one thread may call it.
 #pragma once
 
 #include <algorithm>
@@ -27,22 +27,22 @@ using Token = std::variant<std::string, std::function<std::string()>>;
 /// ever; `refused` says why its servers refuse it.
 using OnChange = std::function<void(const std::string& what, const std::string& why)>;
 
-/// Where a client connects, and how.
+/// The address of the platform, and the settings of a robot's connection.
 struct Options {
     std::string url{};             ///< ws://HOST:PORT/ws or wss://HOST/ws
     Token token{};                 ///< a connection with a fixed token is closed when the token expires
     std::string sdk = "rse-pf-cpp/1";  ///< name and version of the program, for the server's log
-    std::string ca_file{};         ///< authorities to trust, in PEM; empty: the machine's
+    std::string ca_file{};         ///< file of trusted authorities in PEM; empty: those of the machine
     double connect_timeout_s = 2, reconnect_base_s = 0.1, reconnect_max_s = 1;
-    double reconnect_long_max_s = 40;  ///< longest pause after minutes without a connection; after a refusal half of it at least
-    double answer_timeout_s = 5;   ///< deadline of a command that sets none
+    double reconnect_long_max_s = 40;  ///< longest pause between attempts; after a refusal a pause is at least half of this
+    double answer_timeout_s = 5;   ///< deadline of a command without `CallOptions::deadline_s`
     int first_tries = 4;           ///< attempts of `Robot::connect` before it gives up
     OnChange on_change{};          ///< called on the thread of callbacks
 };
 
 namespace detail {
 
-/// Return why a close code refuses a robot for a while; an empty code: connect again at once.
+/// Return the refusal that a close code means; a Failure with an empty code if the robot may reconnect at once.
 inline Failure refusal_of(unsigned code, const std::string& reason) {
     const std::string why = reason.empty() ? "" : ": " + reason;
     switch (code) {
@@ -69,13 +69,13 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
     asio::io_context io{1};
     Session session;
-    std::optional<Failure> fatal;    ///< closed, or never connected
-    std::optional<Failure> refusal;  ///< what the servers say now, while they do not take this robot
+    std::optional<Failure> fatal;    ///< why there will be no further connection: closed, or never connected
+    std::optional<Failure> refusal;  ///< why all servers refuse this robot now
 
     /// Return why a command cannot be sent, null if it may wait for a connection.
     const Failure* reason() const { return fatal ? &*fatal : refusal ? &*refusal : nullptr; }
 
-    /// Connect; *on_open* is called once: with nothing, or with why there is no connection.
+    /// Connect; *on_open* is called once, without a value after the first Welcome, or with the failure.
     void open(std::function<void(std::optional<Failure>)> on_open) {
         on_open_ = std::move(on_open);
         restart_pauses();
@@ -83,7 +83,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         dial();
     }
 
-    /// Send what the session has to send.
+    /// Write the messages that the session has queued, and close the old connections that have no unanswered command.
     void pump() {
         if (const auto& now = channel_) write(now);
         for (const auto& each : leaving_) write(each);
@@ -105,7 +105,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         }
     }
 
-    /// End everything; the io_context has no work left soon after.
+    /// Close all connections and end all commands with *failure*; the io_context then runs out of work.
     void shut(const Failure& failure) {
         if (std::exchange(shut_, true)) return;
         if (!fatal) fatal = failure;
@@ -125,8 +125,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
     bool connected() const { return channel_ != nullptr; }
 
   private:
-    /// How long a TCP connection may take: Linux repeats an unanswered attempt after 1, 3 and 7 s only.
-    static constexpr double answer_within_s = 1;
+    /// Longest duration of a TCP handshake. Linux repeats an unanswered SYN after 1, 3 and 7 s; a new attempt is faster.
+    static constexpr double tcp_timeout_s = 1;
 
     /// One WebSocket.
     struct Channel {
@@ -162,13 +162,13 @@ class Connection : public std::enable_shared_from_this<Connection> {
         auto channel = std::make_shared<Channel>(io, tls_);
         channel->token = token;
         dialing_ = channel;
-        limit(channel, std::min(answer_within_s, options_.connect_timeout_s));
+        limit(channel, std::min(tcp_timeout_s, options_.connect_timeout_s));
         const auto self = shared_from_this();
         if (!std::exchange(looking_, true)) {
             resolver_.async_resolve(address_.host, address_.port, [self](error_code failed, auto found) { self->looked_up(failed, found); });
         }
         if (known_.empty()) return;
-        // A lookup that takes longer goes on, for the next attempt.
+        // After 250 ms connect to the known addresses; the lookup continues, and the next attempt uses its result.
         channel->lookup_timer.expires_after(std::chrono::milliseconds(250));
         channel->lookup_timer.async_wait([self, channel](error_code stopped) {
             if (!stopped) self->connect_tcp(channel);
@@ -180,27 +180,27 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (!failed) known_.assign(found.begin(), found.end());
         if (shut_ || !dialing_ || dialing_->connecting) return;
         if (!known_.empty()) connect_tcp(dialing_);
-        else gone(dialing_, failed);
+        else has_ended(dialing_, failed);
     }
 
-    /// Connect to the known addresses; what is tried is what dials.
+    /// Connect to the known addresses, one after the other.
     void connect_tcp(const ChannelPtr& channel) {
         if (channel != dialing_ || std::exchange(channel->connecting, true)) return;
         channel->lookup_timer.cancel();
         const auto self = shared_from_this();
         asio::async_connect(channel->ws.next_layer().socket(), known_, [self, channel](error_code unreachable, const tcp::endpoint&) {
             channel->accepted = !unreachable || unreachable == asio::error::connection_refused || unreachable == asio::error::connection_reset;
-            if (self->gone(channel, unreachable)) return;
+            if (self->has_ended(channel, unreachable)) return;
             self->limit(channel, self->options_.connect_timeout_s);
             error_code ignored;
             channel->ws.next_layer().socket().set_option(tcp::no_delay(true), ignored);
             channel->ws.next_layer().async_secure(self->address_.host, [self, channel](error_code untrusted) {
-                if (!self->gone(channel, untrusted)) self->handshake(channel);
+                if (!self->has_ended(channel, untrusted)) self->handshake(channel);
             });
         });
     }
 
-    /// End the attempt unless the next step is taken within *seconds*.
+    /// End the attempt unless its next step completes within *seconds*.
     void limit(const ChannelPtr& channel, double seconds) {
         const auto self = shared_from_this();
         channel->timer.expires_after(std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::duration<double>(seconds)));
@@ -208,7 +208,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
             if (stopped || channel->link || channel->ended) return;
             channel->timed_out = true;
             if (channel->connecting) channel->ws.next_layer().close();
-            else self->gone(channel, asio::error::timed_out);
+            else self->has_ended(channel, asio::error::timed_out);
         });
     }
 
@@ -233,7 +233,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
                 self->dial_failed(refused(self->address_.shown(), response.result_int(), std::string(response[http::field::retry_after]), response.body()));
                 return;
             }
-            if (self->gone(channel, failed)) return;
+            if (self->has_ended(channel, failed)) return;
             channel->timer.cancel();
             if (response[http::field::sec_websocket_protocol] != "rse-pf.v1.bin") {
                 self->drop(channel);
@@ -246,8 +246,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
         });
     }
 
-    /// Return whether an attempt is over: given up, or failed.
-    bool gone(const ChannelPtr& channel, error_code failed) {
+    /// Return whether the attempt of *channel* has ended; if *failed* is an error, end the attempt first.
+    bool has_ended(const ChannelPtr& channel, error_code failed) {
         if (channel != dialing_) return true;
         if (!failed) return false;
         const std::string cause = channel->timed_out ? "no answer in time" : cause_of(failed);
@@ -280,17 +280,18 @@ class Connection : public std::enable_shared_from_this<Connection> {
         }
         if (!failed.unanswered && failing_since_ == never) failing_since_ = now_s();
         const double spent = now_s() - dial_began_;
-        // Robots that are told the same time to wait do not come back at the same moment.
+        // Jitter, so that robots that receive the same Retry-After do not reconnect at the same moment.
         const double asked = failed.after_s * uniform(1, 1.25);
         retry_in(std::max(asked, (failed.unanswered ? uniform(1, 1.25) : pause_s()) - spent));
     }
 
-    /// Return whether *failed* is a refusal, and not one that is known to be over soon.
+    /// Return whether *failed* is a refusal that is not known to end within 2 s.
     static bool lasts(const DialFailure& failed) {
         return failed.is_refusal && !(failed.valid_from && *failed.valid_from - wall_s() <= 2);
     }
 
-    /// Go on later: when a token is late enough after a cut-off, or after 20 to 40 s; until then calls end with the reason.
+    /// Schedule the next attempt after a refusal: in 20 to 40 s, or as soon as tokens are accepted after a cut-off. Until a
+    /// server accepts the robot, calls end with the refusal.
     void refused_now(const DialFailure& failed) {
         double wait = uniform(options_.reconnect_long_max_s / 2, options_.reconnect_long_max_s);
         if (failed.valid_from) wait = std::min(wait, std::max(0.0, *failed.valid_from - wall_s()) + uniform(0, 0.5));
@@ -307,7 +308,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     double uniform(double least, double most) { return std::uniform_real_distribution<double>(least, most)(random_); }
 
     double pause_s() {
-        // After the first seconds of failing attempts, ever more rarely: a firewall counts the attempts of an address.
+        // Pauses grow with the time since the first failure: a firewall counts the attempts of an address.
         const double longest = std::min(options_.reconnect_long_max_s, failing_since_ == never ? 0 : (now_s() - failing_since_) / 3);
         if (longest > options_.reconnect_max_s) return uniform(longest / 2, longest);
         return uniform(0, std::min(options_.reconnect_max_s, options_.reconnect_base_s * std::pow(2.0, std::min(attempt_, 20))));
@@ -332,7 +333,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         asked_again_ = false;
         refusal.reset();
         if (channel_ && channel->link->server == channel_->link->server && now_s() < move_until_) {
-            close(channel);  // the server that wants to be left
+            close(channel);  // the load balancer chose the server that asked the robot to move
             ++attempt_;
             retry_in(pause_s());
             return;
@@ -360,36 +361,36 @@ class Connection : public std::enable_shared_from_this<Connection> {
                 return;
             }
             self->session.stats.bytes_in += size;
-            self->hear(channel);
+            self->receive(channel);
             if (!channel->ended) self->read(channel);
         });
     }
 
-    void hear(const ChannelPtr& channel) {
+    void receive(const ChannelPtr& channel) {
         const auto data = channel->buffer.cdata();
-        Heard heard;
+        ServerRequest request;
         try {
             if (!channel->ws.got_binary()) throw RsePfError("bad-message", "the server sent text");
-            heard = session.receive(channel->link, {static_cast<const char*>(data.data()), data.size()}, now_s());
+            request = session.receive(channel->link, {static_cast<const char*>(data.data()), data.size()}, now_s());
         } catch (const std::exception& error) {
             session.stats.last_error = error.what();
             if (++channel->bad_messages > 10) lost(channel, "too many messages that cannot be decoded");
         }
         channel->buffer.consume(channel->buffer.size());
-        switch (heard.what) {
-            case Heard::welcome: welcomed(channel); break;
-            case Heard::move:
+        switch (request.kind) {
+            case ServerRequest::welcome: welcomed(channel); break;
+            case ServerRequest::move:
                 if (channel == channel_ && !shut_) {
-                    move_until_ = now_s() + heard.within_s;
+                    move_until_ = now_s() + request.within_s;
                     restart_pauses();
                     dial();
                 }
                 break;
-            case Heard::renewed:
+            case ServerRequest::renewed:
                 if (!renewing_.empty()) channel->token = renewing_;
                 break;
-            case Heard::notice: session.stats.last_error = heard.failure.code + ": " + heard.failure.message; break;
-            case Heard::nothing: break;
+            case ServerRequest::notice: session.stats.last_error = request.failure.code + ": " + request.failure.message; break;
+            case ServerRequest::nothing: break;
         }
         pump();
     }
@@ -410,7 +411,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         });
     }
 
-    /// Close politely; the timeout of the WebSocket ends it otherwise.
+    /// Begin the closing handshake; the timeout of the WebSocket closes the connection if the server does not answer.
     void close(const ChannelPtr& channel) {
         if (channel->ended || std::exchange(channel->closing, true)) return;
         const auto self = shared_from_this();
@@ -477,7 +478,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
     bool has_token_function() const { return options_.token.index() == 1; }
 
-    void changed(const char* what, const std::string& why) { session.tell(options_.on_change, std::string(what), why); }
+    void changed(const char* what, const std::string& why) { session.notify(options_.on_change, std::string(what), why); }
 
     // --- time and tokens --------------------------------------------------------------------------
 
@@ -485,7 +486,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (shut_) return;
         const double now = now_s();
         session.due(now);
-        // Somebody set the clock of this robot: the next token may be accepted.
+        // The clock of this robot was set: the next token may be accepted.
         if (refusal && std::abs(wall_s() - now - clock_offset_) > 0.5) {
             clock_offset_ = wall_s() - now;
             retry_in(0);

@@ -1,4 +1,4 @@
-// What an HTTP answer that is no success means: to a handshake, or of the data service.
+// Decode unsuccessful HTTP answers, to a handshake or of the data service.
 #pragma once
 
 #include <algorithm>
@@ -16,7 +16,7 @@ namespace rse_pf::detail {
 inline double now_s() {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
-/// Unix seconds, the clock by which a robot signs its tokens; it may be wrong, and be set.
+/// Unix seconds by the clock with which a robot signs its tokens. The clock may be wrong, and may be set.
 inline double wall_s() {
     return std::chrono::duration<double>(std::chrono::system_clock::now().time_since_epoch()).count();
 }
@@ -25,14 +25,14 @@ inline double wall_s() {
 struct DialFailure {
     Failure failure;
     double after_s = 0;
-    bool is_refusal = false;     // by a server, of this robot; it may last
+    bool is_refusal = false;     // a server refuses this robot, maybe for long
     bool wrong_address = false;  // ends the first connect
-    bool unanswered = false;     // nobody accepted the TCP connection
-    bool refuses_any = false;    // another token, signed now, would be refused, too
+    bool unanswered = false;     // no host accepted the TCP connection
+    bool refuses_any = false;    // a fresh token would be refused, too
     std::optional<double> valid_from{};  // Unix time from which tokens are accepted
 };
 
-/// The strings and numbers of a JSON object, without those in objects inside of it; a tree would make programs larger.
+/// Collects the strings and numbers at the top level of a JSON object. A parsed tree would make programs larger.
 struct Strings final : nlohmann::json_sax<nlohmann::json> {
     std::map<std::string, std::string> found;
     std::map<std::string, double> numbers;
@@ -64,22 +64,22 @@ struct Strings final : nlohmann::json_sax<nlohmann::json> {
     bool parse_error(std::size_t, const std::string&, const nlohmann::detail::exception&) override { return false; }
 };
 
-/// Return what an HTTP answer to the handshake means.
+/// Return the failure that an HTTP answer to the handshake states.
 inline DialFailure refused(const std::string& address, unsigned status, const std::string& retry_after, const std::string& body) {
-    Strings told;
-    nlohmann::json::sax_parse(body, &told);
-    const auto field = [&](const char* name) { return told.found[name]; };
+    Strings fields;
+    nlohmann::json::sax_parse(body, &fields);
+    const auto field = [&](const char* name) { return fields.found[name]; };
     DialFailure out;
     out.failure = {field("code"), field("message"), field("hint")};
     if (!retry_after.empty() && retry_after.size() < 6 && retry_after.find_first_not_of("0123456789") == std::string::npos) {
         out.after_s = std::min(300.0, std::stod(retry_after));
     }
-    // Firewalls and login pages answer so, too: only what carries the mark of a server concerns this robot.
+    // Firewalls and login pages answer 401 and 403, too: only a body with "platform": "rse-pf" is a refusal of this robot.
     out.is_refusal = (status == 401 || status == 403) && field("platform") == "rse-pf";
     const std::string cause = field("cause");
     out.refuses_any = cause == "disabled" || cause == "cut-off" || cause == "not-yet-valid";
-    const auto from = told.numbers.find("valid_from_s");
-    if (from != told.numbers.end() && from->second >= 0 && from->second < 1e11) out.valid_from = from->second;
+    const auto from = fields.numbers.find("valid_from_s");
+    if (from != fields.numbers.end() && from->second >= 0 && from->second < 1e11) out.valid_from = from->second;
     out.wrong_address = status == 400 || status == 404 || status == 426 || status == 200;
     if (out.failure.code.empty()) {
         out.failure.code = status == 401 ? "unauthorized" : status == 403 ? "forbidden" : out.wrong_address ? "unsupported" : "connect";

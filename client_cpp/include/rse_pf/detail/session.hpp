@@ -1,5 +1,5 @@
-// The rules of a session (docs/protocol.md, section 4) without a socket, a thread or a clock: messages and times go in,
-// bytes and callbacks come out.
+// The rules of a session (docs/protocol.md, section 4) as a state machine without socket, thread or clock: its inputs are
+// messages and times in seconds, its outputs are bytes and calls of callbacks.
 #pragma once
 
 #include <cstdint>
@@ -18,15 +18,15 @@
 
 namespace rse_pf {
 
-/// Counts of what a client sent and heard.
+/// Counters of one robot since it was made.
 struct Stats {
     std::uint64_t sent = 0, answered = 0, failed = 0, resent = 0, reconnects = 0, moves = 0;
-    std::uint64_t dropped_answers = 0;      ///< to ids that were answered already, or were given up
-    std::uint64_t callback_errors = 0;      ///< exceptions of callbacks and of the token source, which end there
+    std::uint64_t dropped_answers = 0;      ///< answers to commands that had ended already
+    std::uint64_t callback_errors = 0;      ///< exceptions of callbacks and of the token function
     std::uint64_t bytes_in = 0, bytes_out = 0;
     std::map<std::string, std::uint64_t> failures_by_code{};
-    /// Commands that were not sent at once although there was a connection: after a busy answer (to
-    /// this command, or another one of the stream), or by what the Welcome allows.
+    /// Commands that were not sent at once although there was a connection: by `busy` (the server's answer to this command
+    /// or another one of its stream) or `own-limit` (limits of the Welcome).
     std::map<std::string, std::uint64_t> held_back{{"busy", 0}, {"own-limit", 0}};
     std::size_t unanswered = 0;
     std::string last_error{};
@@ -37,13 +37,13 @@ using OnSubscriptionEnd = std::function<void(const Failure&)>;
 
 namespace detail {
 
-/// Times of a session, in seconds; the defaults are those of the protocol page.
+/// Timeouts and intervals of a session, in seconds; the defaults are those of docs/protocol.md.
 struct SessionTimes {
     double answer_timeout = 5, ping_interval = 2, ping_timeout = 3, hello_timeout = 5, stall_timeout = 1;
-    double token_timeout = 30;  ///< a service that issues tokens answers within seconds; a later answer is a failure
+    double token_timeout = 30;  ///< longest duration of a call of the token function
 };
 
-/// What the robot knows of one connection.
+/// State of one connection.
 struct Link {
     double opened = 0, last_heard = 0, last_checked = 0;
     std::optional<double> last_ping, ping_sent;
@@ -64,9 +64,9 @@ struct Command {
     OnEnd<Answer> on_end;
 };
 
-/// What a message of the server asks of the connection.
-struct Heard {
-    enum What { nothing, welcome, move, notice, renewed } what = nothing;
+/// What the connection must do after a message of the server.
+struct ServerRequest {
+    enum Kind { nothing, welcome, move, notice, renewed } kind = nothing;
     double within_s = 0;
     Failure failure{};
 };
@@ -79,8 +79,8 @@ class Session {
 
     const std::shared_ptr<Link>& current() const { return current_; }
 
-    /// Call *callback*; what it throws ends here and is counted.
-    template <class Callback, class... Arguments> void tell(const Callback& callback, Arguments&&... arguments) {
+    /// Call *callback*; catch and count its exceptions.
+    template <class Callback, class... Arguments> void notify(const Callback& callback, Arguments&&... arguments) {
         if (!callback) return;
         try {
             callback(std::forward<Arguments>(arguments)...);
@@ -92,7 +92,7 @@ class Session {
         }
     }
 
-    /// Take over a command; it is sent as soon as the limits of a connection allow.
+    /// Queue a command; it is sent as soon as there is a connection whose limits allow it.
     void submit(Command command, double now) {
         ++stats.sent;
         const auto& options = command.options;
@@ -121,7 +121,7 @@ class Session {
         flush(now);
     }
 
-    /// Give up a command: it ends as `cancelled`; the server is asked to cancel one that is long.
+    /// Cancel a command: it ends as `cancelled`; the server is asked to cancel a long one, too.
     void cancel(std::uint64_t id) {
         const auto found = pending_.find(id);
         if (found == pending_.end() || found->second.cancelled) return;
@@ -130,7 +130,7 @@ class Session {
         if (pending.is_long) cancel_on_server(pending);
         else if (!pending.link) erase(found);
         else pending.cancelled = true;
-        finish(command, Failure{"cancelled", "the robot took the command back"});
+        finish(command, Failure{"cancelled", "the program cancelled the command"});
     }
 
     void subscribe(std::uint64_t id, std::string topic, OnUpdate on_update, OnSubscriptionEnd on_end, double now) {
@@ -139,7 +139,7 @@ class Session {
     }
 
     void unsubscribe(std::uint64_t id, double now) {
-        if (subscriptions_.erase(id) > 0 && current_) say(about("unsubscribe", id), now);
+        if (subscriptions_.erase(id) > 0 && current_) say(message_with_id("unsubscribe", id), now);
     }
 
     void renew(Link& link, const std::string& token, double now) {
@@ -155,7 +155,7 @@ class Session {
         return link;
     }
 
-    /// Send on *link* from now on; what is unanswered on the earlier connection stays there.
+    /// Send on *link* from now on. Commands that the earlier connection has not answered stay there, except long ones.
     void adopt(const std::shared_ptr<Link>& link, double now) {
         const auto before = std::exchange(current_, link);
         busy_.clear();
@@ -169,7 +169,7 @@ class Session {
         flush(now);
     }
 
-    /// Take that the connection of *link* ended; its commands wait for the next one.
+    /// Record that *link* was lost; its commands wait for the next connection.
     void lose(const std::shared_ptr<Link>& link) {
         link->lost = true;
         if (current_ == link) current_.reset();
@@ -181,8 +181,8 @@ class Session {
         }
     }
 
-    /// Take one message of the server; throws RsePfError `bad-message`.
-    Heard receive(const std::shared_ptr<Link>& link, std::string_view data, double now) {
+    /// Handle one message of the server; throws RsePfError `bad-message`.
+    ServerRequest receive(const std::shared_ptr<Link>& link, std::string_view data, double now) {
         link->last_heard = now;
         const ServerMessage message = read_message(data);
         const auto type = message.type;
@@ -200,12 +200,12 @@ class Session {
             link->limits = message.limits;
             link->rate = RateLimiter(message.limits, now);
             if (message.token_s) link->renewal.expires_in(*message.token_s, now);
-            return {Heard::welcome};
+            return {ServerRequest::welcome};
         }
-        if (type == "move") return {Heard::move, std::isfinite(message.within_ms) ? message.within_ms / 1e3 : 0};
+        if (type == "move") return {ServerRequest::move, std::isfinite(message.within_ms) ? message.within_ms / 1e3 : 0};
         if (type == "renewed") {
             link->renewal.expires_in(message.token_s.value_or(3600), now);
-            return {Heard::renewed};
+            return {ServerRequest::renewed};
         }
         if (type == "update") updated(link, message);
         else if (type == "progress") progressed(link, message);
@@ -213,7 +213,7 @@ class Session {
         return {};
     }
 
-    /// Do what is due: end commands whose deadline passed, send what may be sent.
+    /// End the commands whose deadline has passed, and send the commands that may be sent.
     void due(double now) {
         if (now >= next_deadline_) {
             next_deadline_ = never;
@@ -225,10 +225,10 @@ class Session {
                     continue;
                 }
                 const Command command = pending.command;
-                const bool told = !pending.cancelled;
+                const bool must_notify = !pending.cancelled;
                 if (pending.is_long) cancel_on_server(pending);
                 else erase(here);
-                if (told) finish(command, Failure{"expired", "no answer within the deadline", {}, {}, {}, command.options.trace});
+                if (must_notify) finish(command, Failure{"expired", "no answer within the deadline", {}, {}, {}, command.options.trace});
             }
         }
         flush(now);
@@ -237,7 +237,7 @@ class Session {
     /// Send a ping if one is due; return why the connection counts as lost, or nullptr.
     const char* check(const std::shared_ptr<Link>& link, double now, bool& renewal_is_due) {
         if (link->lost) return nullptr;
-        if (now - link->last_checked >= times_.stall_timeout) {  // this process did not run: nobody was silent
+        if (now - link->last_checked >= times_.stall_timeout) {  // this process was suspended: the server was not silent
             link->last_heard = now;
             if (link->ping_sent) link->ping_sent = now;
         }
@@ -267,7 +267,7 @@ class Session {
         return std::max(now, std::min({now + times_.stall_timeout / 3, next_deadline_, next_retry_}));
     }
 
-    /// Return how many commands on *link* have no answer and are not given up.
+    /// Return how many commands on *link* are neither answered nor cancelled.
     std::size_t unanswered_on(const std::shared_ptr<Link>& link) const {
         std::size_t n = 0;
         for (const auto& [id, pending] : pending_) n += pending.link == link && !pending.cancelled;
@@ -280,11 +280,11 @@ class Session {
         return n;
     }
 
-    /// End everything with *failure*, because no further connection will be opened.
+    /// End all commands and subscriptions with *failure*; no further connection will be opened.
     void abandon(const Failure& failure) {
         end_commands(failure);
         auto subscriptions = std::exchange(subscriptions_, {});
-        for (auto& [id, each] : subscriptions) tell(each.on_end, failure);
+        for (auto& [id, each] : subscriptions) notify(each.on_end, failure);
     }
 
     /// End every command with *failure*; the subscriptions wait for the next connection.
@@ -317,10 +317,10 @@ class Session {
         OnUpdate on_update;
         OnSubscriptionEnd on_end;
     };
-    /// Until when a stream is held back, and the answer that said so.
+    /// The end of the pause of a stream, and the `busy` answer that began it.
     struct Busy {
         double until = 0;
-        Failure told{};
+        Failure failure{};
     };
     using PendingMap = std::map<std::uint64_t, Pending>;
 
@@ -357,10 +357,10 @@ class Session {
             const double until = busy == busy_.end() ? 0 : busy->second.until;
             const double held = std::max(pending.not_before, until);
             if (now < until && until >= pending.deadline) {
-                Failure told = busy->second.told;
-                told.trace = options.trace;
-                told.retry_after_ms = (until - now) * 1e3;
-                end(found, std::move(told));
+                Failure failure = busy->second.failure;
+                failure.trace = options.trace;
+                failure.retry_after_ms = (until - now) * 1e3;
+                end(found, std::move(failure));
             } else if (now < held) {
                 hold(pending, "busy", held);
             } else if (current_->in_flight >= std::max<std::size_t>(1, current_->limits.max_in_flight)) {
@@ -373,7 +373,7 @@ class Session {
         }
     }
 
-    /// Let a command wait for an answer, or until *until_s*; count it once.
+    /// Hold a command back until *until_s*, or until an answer arrives; count the command once.
     void hold(Pending& pending, const char* why, double until_s) {
         next_retry_ = std::min(next_retry_, until_s);
         if (!std::exchange(pending.was_held, true)) ++stats.held_back[why];
@@ -394,7 +394,7 @@ class Session {
     void cancel_on_server(Pending& pending) {
         pending.cancelled = true;
         pending.deadline = never;
-        if (pending.link) pending.link->outgoing.push_back(about("cancel", pending.command.id));
+        if (pending.link) pending.link->outgoing.push_back(message_with_id("cancel", pending.command.id));
     }
 
     void detach(std::uint64_t id, Pending& pending) {
@@ -425,25 +425,25 @@ class Session {
             ++stats.failed;
             ++stats.failures_by_code[outcome.failure().code];
         }
-        tell(command.on_end, std::move(outcome));
+        notify(command.on_end, std::move(outcome));
     }
 
     void end(PendingMap::iterator found, Outcome<Answer> outcome) {
         const Command command = std::move(found->second.command);
-        const bool told = !found->second.cancelled;
+        const bool must_notify = !found->second.cancelled;
         erase(found);
-        if (told) finish(command, std::move(outcome));
+        if (must_notify) finish(command, std::move(outcome));
     }
 
-    Heard answered(const std::shared_ptr<Link>& link, const ServerMessage& message, double now) {
+    ServerRequest answered(const std::shared_ptr<Link>& link, const ServerMessage& message, double now) {
         const bool failed = message.type == "failure";
-        if (!message.id) return {Heard::notice, 0, failure_of(message)};
+        if (!message.id) return {ServerRequest::notice, 0, failure_of(message)};
         if (failed) {
             const auto subscription = subscriptions_.find(*message.id);
             if (subscription != subscriptions_.end()) {
                 const auto on_end = std::move(subscription->second.on_end);
                 subscriptions_.erase(subscription);
-                tell(on_end, failure_of(message));
+                notify(on_end, failure_of(message));
                 return {};
             }
         }
@@ -454,7 +454,7 @@ class Session {
         }
         Pending& pending = found->second;
         if (failed) {
-            if (!retries(found, message, now)) end(found, failure_of(message));
+            if (!sends_again(found, message, now)) end(found, failure_of(message));
         } else if (now >= pending.deadline) {
             end(found, Failure{"expired", "the answer came after the deadline"});
         } else {
@@ -488,8 +488,8 @@ class Session {
         return answer;
     }
 
-    /// Let the command wait if a later time or another process may help.
-    bool retries(PendingMap::iterator found, const ServerMessage& failure, double now) {
+    /// Return whether the command is sent again later: after `busy` within its deadline, and once after `worker-lost`.
+    bool sends_again(PendingMap::iterator found, const ServerMessage& failure, double now) {
         Pending& pending = found->second;
         const double pause = std::max(0.0, failure.retry_after_ms.value_or(0)) / 1e3;
         const auto& stream = pending.command.options.stream;
@@ -519,14 +519,14 @@ class Session {
         }
         if (pending.cancelled) return;
         const double done = std::isfinite(message.done) ? std::clamp(message.done, 0.0, 1.0) : 0.0;
-        tell(pending.command.options.on_progress, done, std::string(message.what));
+        notify(pending.command.options.on_progress, done, std::string(message.what));
     }
 
     void updated(const std::shared_ptr<Link>& link, const ServerMessage& message) {
         const auto found = subscriptions_.find(message.id.value_or(0));
         if (found == subscriptions_.end() || link != current_) return;
         const json payload = message.payload.empty() ? json() : json::from_msgpack(message.payload);
-        tell(found->second.on_update, std::string(message.key), payload);
+        notify(found->second.on_update, std::string(message.key), payload);
     }
 
     SessionTimes times_;

@@ -1,4 +1,4 @@
-// Rules of time without a clock: the rate limit, the offset of the server's clock, the renewal of a token.
+// Rules that depend on time, with the time in seconds as an argument: rate limit, clock offset, renewal of a token.
 #pragma once
 
 #include <algorithm>
@@ -12,11 +12,11 @@
 namespace rse_pf::detail {
 
 constexpr double never = std::numeric_limits<double>::infinity();
-/// For how long a client believes one word of a server about its rate.
+/// Longest pause of a stream after one `busy` answer, whatever its retry_after_ms says.
 constexpr double max_pause_s = 60;
 
-/// A token bucket a tenth smaller than the server's, since a network may deliver messages closer together than sent; and
-/// the pause between commands that a server with too much to do tells for a while, which pings do not count towards.
+/// A token bucket of nine tenths of the server's limits, since a network may deliver messages closer together than they
+/// were sent.
 class RateLimiter {
   public:
     RateLimiter() = default;

@@ -1,4 +1,4 @@
-// A TCP connection with or without TLS, as one type: Beast's templates are then instantiated once, not twice.
+// A TCP connection with or without TLS, as one type, so that Beast's templates are instantiated once, not twice.
 #pragma once
 
 #include <algorithm>
@@ -29,7 +29,7 @@ namespace websocket = beast::websocket;
 using boost::system::error_code;
 using asio::ip::tcp;
 
-/// Where a server is: parsed from ws://, wss://, http:// or https://.
+/// Address of a server, parsed from a URL with ws://, wss://, http:// or https://.
 struct Address {
     bool secure = false;
     std::string host, port, target;
@@ -64,13 +64,13 @@ inline Address address_of(const std::string& url) {
     return out;
 }
 
-/// Which certificates are trusted; by default those of the machine's authorities.
+/// Authorities whose certificates are trusted; by default those of the machine.
 struct Trust {
     /// File of authorities in PEM, instead of the machine's.
     std::string ca_file{};
 };
 
-/// Return what checks the server's certificate and name; throws RsePfError `usage` if the file cannot be read.
+/// Return the TLS context that checks the server's certificate and name; throws RsePfError `usage` if the file cannot be read.
 inline std::shared_ptr<asio::ssl::context> tls_context(const Address& address, const Trust& trust) {
     if (!address.secure) return nullptr;
     auto context = std::make_shared<asio::ssl::context>(asio::ssl::context::tls_client);
@@ -83,7 +83,7 @@ inline std::shared_ptr<asio::ssl::context> tls_context(const Address& address, c
     return context;
 }
 
-/// A handler of any type: what follows is compiled for this type only, which halves the time and size of a program.
+/// A type-erased handler: templates below it are instantiated once, which halves compile time and size of a program.
 class AnyHandler {
   public:
     template <class Handler, class = std::enable_if_t<!std::is_same_v<std::decay_t<Handler>, AnyHandler>>>
@@ -106,7 +106,7 @@ class AnyHandler {
     std::unique_ptr<Held> held_;
 };
 
-/// Reads fill one buffer and writes send one: Beast's sequences of buffers are copied before.
+/// A stream whose reads and writes use one buffer each; sequences of buffers of Beast are copied into one.
 class Transport {
   public:
     using Socket = asio::basic_stream_socket<tcp, asio::io_context::executor_type>;
@@ -132,7 +132,7 @@ class Transport {
         write_(AnyHandler(std::forward<Handler>(handler)));
     }
 
-    /// Begin TLS as *host*; without TLS the handler is called at once.
+    /// Do the TLS handshake with *host*; without TLS the handler is called at once.
     template <class Handler> void async_secure(const std::string& host, Handler&& handler) {
         if (!stream_) {
             asio::post(get_executor(), [handler = std::forward<Handler>(handler)]() mutable { handler(error_code{}); });
@@ -183,7 +183,7 @@ inline void beast_close_socket(Transport& transport) { transport.close(); }
 
 inline const std::string untrusted_certificate = "the certificate is not trusted";
 
-/// Return one sentence for what a handshake or a connection ended with.
+/// Return the cause of a failed handshake or connection in a few words.
 inline std::string cause_of(const error_code& error) {
     if (error.category() == asio::error::get_ssl_category()) {
         return ERR_GET_REASON(static_cast<unsigned long>(error.value())) == SSL_R_CERTIFICATE_VERIFY_FAILED
