@@ -212,8 +212,8 @@ def map_source(
             f"{request.source} has {what}, so that its scale is known",
             hint=f"leave out --scale, or add {option}",
         )
-    from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
     from rse_pf.extensions.experiments.results.markdown import lost_line
+    from rse_pf.maps.map_image import RobotPath, draw_map
 
     _make_folder(request.out)
     kept_in = drive_store(request.objects, settings)

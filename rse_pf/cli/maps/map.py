@@ -242,7 +242,7 @@ def _prune(request: _PruneRequest, settings: PlatformSettings) -> None:
 
 def _draw(png: Path, name: str, maps: MapRegistry, record: MapRecord) -> None:
     """Draw points and paths of a version of map *name* into *png*; raises UsageError if it has none."""
-    from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
+    from rse_pf.maps.map_image import RobotPath, draw_map
 
     _check_folder(png)
     version = maps.load(name, record.id)

@@ -19,9 +19,9 @@ from client_sdk.point_map import write_ply
 from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
-from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.extensions.experiments.results.map_error import JoinedRobot, joined_robots, merge_section
 from rse_pf.maps.format import MapVersion, decode_map
+from rse_pf.maps.map_image import RobotPath, draw_map
 from rse_pf.services.mapping.merge import MergeReply
 
 __all__ = [

@@ -41,7 +41,6 @@ from rse_pf.extensions.experiments.demo.robot import (
     run_robot,
 )
 from rse_pf.extensions.experiments.harness import Harness
-from rse_pf.extensions.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.extensions.experiments.results.live_error import (
     LIVE_MAP,
     live_figures,
@@ -59,6 +58,7 @@ from rse_pf.extensions.experiments.results.result_folder import (
 from rse_pf.geometry import Array
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.maps.format import MapVersion
+from rse_pf.maps.map_image import RobotPath, draw_map
 from rse_pf.terminal import show_page
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.plots.map_image import (
+from rse_pf.geometry import Array
+from rse_pf.maps.map_image import (
     COLOURS,
     INK,
     draw_legend,
@@ -23,7 +24,6 @@ from rse_pf.extensions.experiments.plots.map_image import (
     fitting,
     pillow,
 )
-from rse_pf.geometry import Array
 from rse_pf.terminal import printable
 
 __all__ = ["DrawnPath", "Panel", "draw_trajectories", "pieces"]

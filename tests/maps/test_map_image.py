@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf.extensions.experiments.plots.map_image import _BACKGROUND, RobotPath, draw_map
+from rse_pf.maps.map_image import _BACKGROUND, RobotPath, draw_map
 
 image = pytest.importorskip("PIL.Image")
 
