@@ -12,14 +12,14 @@ from rse_pf.geometry import Camera
 __all__ = ["corrected"]
 
 _CAMERA = ("fx", "fy", "cx", "cy")  # corrections of the pinhole camera, px
-_LENS = ("k1", "k2", "p1", "p2", "k3")  # corrections of the distortion, in the order of its coefficients
+_MODEL = "radial-tangential"  # lens model whose ``k1`` a correction of the distortion is
 
 
 def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intrinsics, tuple[str, ...]]:
     """Return intrinsics with corrections of those *findings* that are certain, and a text on each change.
 
-    A correction of the distortion is applied only if *intrinsics* has none: the estimate describes what
-    remains after undistortion, which cannot be added to the coefficients of an existing model.
+    A correction of the distortion is applied only to a radial-tangential lens without distortion: the
+    estimate is ``k1`` of what remains after undistortion, which no other model or coefficient expresses.
     """
     changed: list[str] = []
     camera, lens = intrinsics.camera, intrinsics.distortion
@@ -32,9 +32,9 @@ def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intr
             if name in finding.correction:
                 changed.append(f"{name} {values[name]:.2f} to {finding.correction[name]:.2f}")
                 values[name] = finding.correction[name]
-        if any(name in finding.correction for name in _LENS) and not any(lens):
-            lens = tuple(finding.correction.get(name, 0.0) for name in _LENS)
-            changed.append("distortion none to " + ", ".join(f"{each:.4f}" for each in lens))
+        if "k1" in finding.correction and intrinsics.model == _MODEL and not any(lens):
+            lens = (finding.correction["k1"], 0.0, 0.0, 0.0)
+            changed.append(f"k1 0 to {lens[0]:.4f}")
         if finding.kind is FaultKind.DEPTH_SCALE:
             scale = intrinsics.depth_units_per_m / (1.0 + finding.value)
             changed.append(f"depth_scale {intrinsics.depth_units_per_m:.6g} to {scale:.6g}")

@@ -66,16 +66,13 @@ class DriveModel:
     """The longest connected part of a drive, with the poses and landmarks with which an adjustment begins.
 
     ``rows`` ``(k,)`` are the indices of its keyframes among those of the drive; ``T_camera_world``
-    ``(k, 4, 4)`` their poses, and ``points_world`` ``(l, 3)`` the landmarks, both in metres.  ``score`` is
-    the mean cost of the observations of the whole drive before adjustment, see `_chain_poses`; NaN for poses
-    that do not come from depths.
+    ``(k, 4, 4)`` their poses, and ``points_world`` ``(l, 3)`` the landmarks, both in metres.
     """
 
     rows: Rows
     observed: DriveObservations
     T_camera_world: Array
     points_world: Array
-    score: float
 
 
 def best_reading(keyframes: list[Keyframe], tracks: Tracks) -> DepthReading:
@@ -128,9 +125,8 @@ def drive_model(
     pixels = np.concatenate([each.pixels for each in keyframes])[at]
     sizes = np.concatenate([each.sizes for each in keyframes])[at]
     variances = np.concatenate([_variances(each, reading) for each in keyframes])[at]
-    score = np.nan
     if by_depth:
-        poses, score = _chain_poses(camera, tracks, pixels, depths, np.sqrt(variances), len(keyframes))
+        poses, _ = _chain_poses(camera, tracks, pixels, depths, np.sqrt(variances), len(keyframes))
     else:
         poses = np.array(
             [
@@ -155,9 +151,7 @@ def drive_model(
         twists_s=np.array([keyframes[row].twist_s for row in rows]),
     )  # fmt: skip
     points = triangulate_landmarks(observed, poses[rows], len(seen))
-    return DriveModel(
-        rows=rows, observed=observed, T_camera_world=poses[rows], points_world=points, score=score
-    )
+    return DriveModel(rows=rows, observed=observed, T_camera_world=poses[rows], points_world=points)
 
 
 def _score(keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading) -> float:

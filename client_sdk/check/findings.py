@@ -81,7 +81,7 @@ class Finding:
         sentence: What is wrong and by how much, with the deviation.
         fix: What the user should do.
         correction: Keys of ``intrinsics.json`` and the numbers that they should have; empty if the fault is
-            not in that file.  Distortion is ``k1``, ``k2``, ``p1``, ``p2``, ``k3``.
+            not in that file.
 
     Raises:
         UsageError: A number is not finite, or the deviation or the cost is below 0.

@@ -46,7 +46,13 @@ def test_distortion_is_not_added_to_that_of_a_lens() -> None:
     found = [finding(FaultKind.DISTORTION, -0.1, k1=-0.1)]
 
     assert corrected(bent, found) == (bent, ())
-    assert corrected(Intrinsics(camera=CAMERA), found)[0].distortion[0] == -0.1
+    assert corrected(Intrinsics(camera=CAMERA), found)[0].distortion == (-0.1, 0.0, 0.0, 0.0)
+
+
+def test_no_lens_model_but_radial_tangential_takes_the_distortion_of_a_pinhole() -> None:
+    fisheye = Intrinsics(camera=CAMERA, model="fisheye")
+
+    assert corrected(fisheye, [finding(FaultKind.DISTORTION, -0.1, k1=-0.1)]) == (fisheye, ())
 
 
 def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
