@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -33,7 +33,6 @@ from rse_pf.extensions.recording.summary import ChunkPlan, Wanted, plan_of, robo
 from rse_pf.geometry import Array
 from rse_pf.limits.budget import Budget, check_size, inflate_within
 from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
-from rse_pf.wire.messages import Identifier
 
 __all__ = [
     "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
@@ -297,32 +296,6 @@ class WireRecording:
             yield self._with_images(
                 replace(asked, answered_ns=message.time_ns, reply_bytes=message.data), images
             )
-        elif channel.direction == "down" and kind == "refused":
-            for number, data in self._failures(channel.codec, message.data):
-                refused = waiting.pop(f"{channel.connection}:{number}", None)
-                if refused is not None:
-                    yield self._with_images(
-                        replace(refused, answered_ns=message.time_ns, reply_bytes=data), images
-                    )
-
-    def _failures(self, codec: str, data: bytes) -> list[tuple[int, bytes]]:
-        """Return the id of each command that a ``refused`` message answers, with an encoded failure for it.
-
-        Servers before version 0.3.0 refused many commands with one such message, which their recordings hold.
-        Empty if the message cannot be decoded.
-        """
-        try:
-            if codec == "bin":
-                refused = msgspec.msgpack.decode(data, type=_Refused)
-            else:
-                text = inflate_within(data, self._budget) if codec == "zlib" else data
-                refused = msgspec.json.decode(text, type=_Refused)
-        except (msgspec.DecodeError, ValueError):
-            self.left_out += 1
-            return []
-        encode = _codec(codec, self._session).encode
-        fields = {name: getattr(refused, name) for name in _Refused.__struct_fields__ if name != "ids"}
-        return [(number, encode(Failure(id=number, **fields))) for number in dict.fromkeys(refused.ids)]
 
     def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None, str]:
         """Return type, id and service of a message; ``("", None, "")`` if it cannot be decoded."""
@@ -444,17 +417,6 @@ class _Envelope(msgspec.Struct):
     type: str = ""
     id: int | None = None
     service: str = ""
-
-
-class _Refused(msgspec.Struct):
-    """A message of old servers that refuses up to 64 commands with one reason."""
-
-    ids: Annotated[list[Identifier], msgspec.Meta(max_length=64)]
-    code: str
-    message: str
-    hint: str = ""
-    retry_after_ms: float | None = None
-    server: str = ""
 
 
 class _Image(msgspec.Struct):

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.extensions.recording import file_format, reader
 from rse_pf.extensions.recording.reader import open_recording
-from rse_pf.wire import Command, Failure, Result
+from rse_pf.wire import Command, Result
 from tests.kit.recorded_sessions import START_NS, Made, jpeg
 
 
@@ -34,24 +34,6 @@ def test_commands_come_with_their_answers_in_the_order_in_which_they_were_answer
     assert commands[2].reply is None
     assert commands[2].round_trip_ms is None
     assert commands[0].about["side"] == "server"
-
-
-@pytest.mark.parametrize("codec", ["bin", "zlib"])
-def test_an_earlier_message_that_ends_many_commands_is_a_failure_of_each(tmp_path: Path, codec: str) -> None:
-    made = Made(tmp_path / "a")
-    first = made.send(1, codec=codec, is_answered=False)
-    refused = {
-        "type": "refused", "ids": [0, 1, 7, 1], "code": "busy", "message": "too many", "retry_after_ms": 20.0,
-    }  # fmt: skip
-    second = made.send(2, codec=codec, answer=refused)
-
-    commands = list(open_recording(made.close()).commands())
-
-    assert [each.id for each in commands] == [first, second]
-    assert [each.reply for each in commands] == [
-        Failure(id=number, code="busy", message="too many", retry_after_ms=20.0) for number in (0, 1)
-    ]
-    assert commands[0].answered_ns == commands[1].answered_ns
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timezone
 
-from rse_pf.extensions.recording.replay.report import Attempt, CommandReport, Histogram
+from rse_pf.extensions.recording.replay.report import Attempt, CommandReport
 from rse_pf.extensions.recording.replay.run import Overview
 from rse_pf.pnp.rules import Rule
 from rse_pf.terminal import counted, printable
@@ -21,16 +21,12 @@ __all__ = ["html_page"]
 
 # Content security policy of the page: no scripts, and no requests.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
-_GRID_COLUMNS = 8  # number of columns of the grid in which matches are counted, as in a `CommandReport`
-_BARS_WIDTH = 460  # width of a bar chart, CSS pixels
-_BARS_HEIGHT = 170  # height of a bar chart with its labels, CSS pixels
-_LABEL_PX = 24  # height for labels above and below the bars, CSS pixels
 _STYLE = """
 :root { color-scheme: light dark;
   --paper: #ffffff; --ink: #1e222a; --pale: #5b6472; --line: #d4d8de; --panel: #f4f6f8;
-  --inlier: #0072b2; --outlier: #d55e00; --good: #00704f; --bad: #b34700; }
+  --good: #00704f; --bad: #b34700; }
 @media (prefers-color-scheme: dark) { :root { --paper: #14171c; --ink: #e6e9ee; --pale: #a3acb9;
-  --line: #353b45; --panel: #1d2128; --inlier: #56b4e9; --outlier: #f08a4b;
+  --line: #353b45; --panel: #1d2128;
   --good: #4bc49a; --bad: #f0a06b; } }
 * { box-sizing: border-box; }
 body { margin: 0; padding: 1.5rem; background: var(--paper); color: var(--ink);
@@ -43,15 +39,12 @@ article { border-top: 3px solid var(--line); margin-top: 2.5rem; padding-top: .5
 .verdict { font-weight: 600; } .good { color: var(--good); } .bad { color: var(--bad); }
 figure { margin: .5rem 0; } figcaption { color: var(--pale); font-size: .87rem; margin-top: .25rem; }
 img { max-width: 100%; height: auto; border: 1px solid var(--line); display: block; }
-.side { display: flex; flex-wrap: wrap; gap: 1.5rem; } .side figure { flex: 1 1 22rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; min-width: 44rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .3rem .7rem .3rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
 th { font-weight: 600; } td.number, th.number { text-align: right; }
 code { font: .92em ui-monospace, monospace; overflow-wrap: anywhere; } td code { white-space: nowrap; }
-svg { max-width: 100%; height: auto; } svg text { fill: var(--ink); font: 11px system-ui, sans-serif; }
-.i { fill: var(--inlier); } .o { fill: var(--outlier); } .axis { stroke: var(--line); }
 """
 
 
@@ -103,7 +96,6 @@ def _report(seen: CommandReport) -> str:
         f"<p>{_equality(seen)}</p>\n",
         f'<p class="pale">{_text(_circumstances(seen))}</p>\n',
         _picture(seen),
-        _charts(seen),
         _rules(seen.rules),
         _attempts("What each engine says", "engine", seen.engines),
         _attempts(
@@ -159,74 +151,6 @@ def _picture(seen: CommandReport) -> str:
         f"<figcaption>{_text(caption)}, on {on}. Blue dots agree with the pose, orange crosses do not; a "
         "line leads from a match to where the pose puts its point.</figcaption></figure>\n"
     )
-
-
-def _charts(seen: CommandReport) -> str:
-    figures = []
-    if seen.errors_px is not None:
-        figures.append(_figure(_bars(seen.errors_px, "px"), "Reprojection error of the matches, pixels."))
-    if seen.depths_m is not None:
-        figures.append(_figure(_bars(seen.depths_m, "m"), "Depth of the points before the camera, metres."))
-    if any(seen.grid_inliers) or any(seen.grid_outliers):
-        figures.append(_figure(_cells(seen.grid_inliers, "i"), "Where in the image the inliers lie."))
-        figures.append(_figure(_cells(seen.grid_outliers, "o"), "Where in the image the outliers lie."))
-    return f'<h3>Where the matches lie</h3>\n<div class="side">{"".join(figures)}</div>\n' if figures else ""
-
-
-def _figure(drawn: str, caption: str) -> str:
-    return f"<figure>{drawn}<figcaption>{_text(caption)}</figcaption></figure>"
-
-
-def _bars(counts: Histogram, unit: str) -> str:
-    """Return an SVG bar chart with two bars for each bin of the histogram: inliers and outliers."""
-    bins = len(counts.inliers)
-    most = max(1, *counts.inliers, *counts.outliers)
-    step, bars_height = _BARS_WIDTH / max(1, bins), _BARS_HEIGHT - 2 * _LABEL_PX
-    base = _BARS_HEIGHT - _LABEL_PX
-    parts = [
-        f'<svg viewBox="0 0 {_BARS_WIDTH} {_BARS_HEIGHT}" width="{_BARS_WIDTH}" role="img" '
-        f'aria-label="inliers and outliers by {unit}">'
-    ]
-    for place, (inliers, outliers) in enumerate(zip(counts.inliers, counts.outliers, strict=True)):
-        for kind, count, shift in (("i", inliers, 0.12), ("o", outliers, 0.5)):
-            height = bars_height * count / most
-            left = (place + shift) * step
-            if count:
-                parts.append(
-                    f'<rect class="{kind}" x="{left:.1f}" y="{base - height:.1f}" width="{0.36 * step:.1f}" '
-                    f'height="{height:.1f}"/><text x="{left + 0.18 * step:.1f}" y="{base - height - 3:.1f}" '
-                    f'text-anchor="middle">{count}</text>'
-                )
-        if place:
-            edge = counts.edges[place]
-            parts.append(
-                f'<text x="{place * step:.1f}" y="{base + 15}" text-anchor="middle">{edge:.3g}</text>'
-            )
-    parts.append(f'<line class="axis" x1="0" y1="{base}" x2="{_BARS_WIDTH}" y2="{base}"/></svg>')
-    return "".join(parts)
-
-
-def _cells(counts: Sequence[int], kind: str) -> str:
-    """Return an SVG of the image's cells, darker with more matches; *kind* is ``i`` (inliers) or ``o``."""
-    most, size = max(1, *counts), 40
-    rows = len(counts) // _GRID_COLUMNS
-    parts = [
-        f'<svg viewBox="0 0 {_GRID_COLUMNS * size} {rows * size}" width="{_GRID_COLUMNS * size}" role="img" '
-        f'aria-label="matches by cell of the image">'
-    ]
-    for place, count in enumerate(counts):
-        row, column = divmod(place, _GRID_COLUMNS)
-        opacity = 0.06 + 0.8 * math.sqrt(count / most) if count else 0.03
-        parts.append(
-            f'<rect class="{kind}" x="{column * size + 1}" y="{row * size + 1}" width="{size - 2}" '
-            f'height="{size - 2}" fill-opacity="{opacity:.2f}"/>'
-        )
-        if count:
-            parts.append(
-                f'<text x="{column * size + size / 2:g}" y="{row * size + size / 2 + 4:g}" '
-                f'text-anchor="middle">{count}</text>'
-            )
-    return "".join((*parts, "</svg>"))
 
 
 def _rules(rules: Sequence[Rule]) -> str:

@@ -13,7 +13,7 @@ from rse_pf.errors import RsePfError
 from rse_pf.extensions.recording.reader import RecordedCommand
 from rse_pf.extensions.recording.replay.picture import match_picture
 from rse_pf.extensions.recording.replay.solving import Again, Overrides, Resolver, pnp_reply
-from rse_pf.geometry import Array, pose_difference, transform
+from rse_pf.geometry import Array, pose_difference
 from rse_pf.pnp import PnpOptions, WeakLimits
 from rse_pf.pnp.engines import engine_for, native_options
 from rse_pf.pnp.native_solver import Evidence, native_solver
@@ -22,14 +22,10 @@ from rse_pf.pnp.rules import Rule, evaluate_rules
 from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import Failure, Result
 
-__all__ = ["Attempt", "CommandReport", "Histogram", "report_of"]
+__all__ = ["Attempt", "CommandReport", "report_of"]
 
 _TRIED_INLIER_PX = (2.0, 4.0, 8.0, 16.0)  # inlier thresholds, px, with which a command is solved again
 _TRIED_ITERATIONS = (100, 1000, 10_000)  # numbers of RANSAC iterations with which it is solved again
-# Edges of the histogram of reprojection errors, px.
-_ERROR_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, math.inf)
-_DEPTH_BINS = 12  # number of bins of the histogram of depths
-_GRID = (8, 6)  # columns and rows of the cells in which matches are counted
 _MAX_NUMBER = 1e12  # largest absolute value in a report; infinite numbers are replaced by it
 _LIMITS = WeakLimits()  # limits of the rules that decide whether a pose is weak
 
@@ -56,21 +52,12 @@ class Attempt(msgspec.Struct, frozen=True, kw_only=True):
     moved_deg: float | None = None
 
 
-class Histogram(msgspec.Struct, frozen=True, kw_only=True):
-    """Number of inliers and of outliers in each bin; *n* bins have *n* + 1 edges in ascending order."""
-
-    edges: tuple[float, ...]
-    inliers: tuple[int, ...]
-    outliers: tuple[int, ...]
-
-
 class CommandReport(msgspec.Struct, frozen=True, kw_only=True):
     """One recorded command: its request and answer, and the results of solving it again.
 
     ``is_equal`` says whether solving it again with the recorded options gave the recorded bytes; ``tried`` is
     the result with the options of the caller, ``engines`` and ``options`` those with other engines and
-    options.  ``grid_inliers`` and ``grid_outliers`` are the numbers of matches in 8 x 6 cells of the image,
-    row by row.
+    options.
     """
 
     id: str
@@ -100,10 +87,6 @@ class CommandReport(msgspec.Struct, frozen=True, kw_only=True):
     engines: tuple[Attempt, ...] = ()
     options: tuple[Attempt, ...] = ()
     rules: tuple[Rule, ...] = ()
-    errors_px: Histogram | None = None
-    depths_m: Histogram | None = None
-    grid_inliers: tuple[int, ...] = ()
-    grid_outliers: tuple[int, ...] = ()
     has_thumbnail: bool = False
     picture_png: bytes = b""
 
@@ -166,10 +149,6 @@ def report_of(
         engines=_engines(command, resolver, pose),
         options=_options(command, resolver, problem, pose),
         rules=problem.rules,
-        errors_px=_errors(problem),
-        depths_m=_depths(problem),
-        grid_inliers=_grid(problem, agrees=True),
-        grid_outliers=_grid(problem, agrees=False),
         picture_png=picture,
     )
 
@@ -326,62 +305,6 @@ def _name_of(overrides: Overrides) -> str:
         "max-iterations": overrides.max_iterations,
     }
     return " ".join(f"--{name} {value}" for name, value in given.items() if value is not None)
-
-
-def _agrees(problem: _Problem) -> npt.NDArray[np.bool_]:
-    agrees = np.zeros(len(problem.pixels), dtype=np.bool_)
-    agrees[problem.inliers] = True
-    return agrees
-
-
-def _errors(problem: _Problem) -> Histogram | None:
-    """Return the histogram of the reprojection errors, infinite behind the camera; None without a pose."""
-    if problem.T_camera_world is None or not len(problem.pixels):
-        return None
-    with np.errstate(all="ignore"):
-        points_camera = transform(problem.T_camera_world, problem.points)
-        errors = np.hypot(*(problem.request.camera.project(points_camera) - problem.pixels).T)
-    errors[~(points_camera[:, 2] > 0.0) | np.isnan(errors)] = np.inf
-    return _histogram(errors, _agrees(problem), _ERROR_EDGES_PX)
-
-
-def _depths(problem: _Problem) -> Histogram | None:
-    """Return the histogram of the points' depths; None without a pose.
-
-    Its inner edges divide the range from the 5th to the 95th percentile.
-    """
-    if problem.T_camera_world is None:
-        return None
-    with np.errstate(all="ignore"):
-        depths = transform(problem.T_camera_world, problem.points)[:, 2]
-    good = depths[np.isfinite(depths)]
-    if not len(good):
-        return None
-    low, high = (float(percentile) for percentile in np.percentile(good, (5, 95)))
-    if not high - low > 1e-9:
-        low, high = low - 0.5, high + 0.5
-    edges = (-math.inf, *np.linspace(low, high, _DEPTH_BINS - 1).tolist(), math.inf)
-    return _histogram(np.nan_to_num(depths, nan=np.inf), _agrees(problem), edges)
-
-
-def _histogram(values: Array, agrees: npt.NDArray[np.bool_], edges: tuple[float, ...]) -> Histogram:
-    inner = np.array(edges[1:-1])
-    places = np.searchsorted(inner, values, side="right")
-    counts = [np.bincount(places[which], minlength=len(edges) - 1).tolist() for which in (agrees, ~agrees)]
-    return Histogram(
-        edges=tuple(_plain(edge) for edge in edges), inliers=tuple(counts[0]), outliers=tuple(counts[1])
-    )
-
-
-def _grid(problem: _Problem, *, agrees: bool) -> tuple[int, ...]:
-    """Return the number of inliers (*agrees*) or outliers in each of 8 x 6 cells of the image, row by row."""
-    camera, (columns, rows) = problem.request.camera, _GRID
-    pixels = problem.pixels[_agrees(problem) == agrees]
-    pixels = pixels[np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < 1e9).all(axis=1)]
-    column = np.clip((pixels[:, 0] * columns / camera.width).astype(np.int64), 0, columns - 1)
-    row = np.clip((pixels[:, 1] * rows / camera.height).astype(np.int64), 0, rows - 1)
-    counts: list[int] = np.bincount(row * columns + column, minlength=rows * columns).tolist()
-    return tuple(counts)
 
 
 def _plain(value: float) -> float:

@@ -14,7 +14,6 @@ import msgspec
 
 from rse_pf.config import PlatformSettings, PnpSettings
 from rse_pf.errors import (
-    BadMessage,
     BadRequest,
     LimitExceeded,
     PnpError,
@@ -122,7 +121,7 @@ class Resolver:
             engine_for(overrides.engine)  # raises an error that names what is missing
         try:
             reply = recorded.reply
-            command = self.decoded(recorded)
+            command = recorded.command
         except RsePfError as error:
             return Again(why_not=f"its bytes cannot be read: {error.message}")
         why_not = self._why_not(command, reply)
@@ -142,24 +141,12 @@ class Resolver:
             return Again(answer=answer, is_equal=True)
         return Again(answer=answer, difference=difference_of(reply, answer) or "the bytes differ")
 
-    def decoded(self, recorded: RecordedCommand) -> Command:
-        """Decode a recorded command with the limits of the settings.
-
-        Raises:
-            BadMessage: The bytes are malformed, or not a command.
-            LimitExceeded: The message is larger than the limits allow.
-        """
-        message = self._codec(recorded.codec).decode_from_robot(recorded.command_bytes)
-        if not isinstance(message, Command):
-            raise BadMessage("a recorded message is no command", hint="record again")
-        return message
-
     def request(self, recorded: RecordedCommand) -> PnpRequest | None:
         """Return the decoded request of a `pnp` command; None for another service.
 
         Raises RsePfError if it cannot be decoded.
         """
-        command = self.decoded(recorded)
+        command = recorded.command
         if command.service != _POSES_SERVICE:
             return None
         request: PnpRequest = request_of(command.payload, self._registry(self._engines[0]).get("pnp"))
