@@ -102,7 +102,6 @@ def noisy_copy(version: MapVersion, number: int) -> MapVersion:
 @benchmark(
     Bar("links_and_clouds_equal", equals=True),
     Bar("apart_mm", at_most=0.1, unit="mm"),
-    Bar("apart_of_one_level_mm", at_most=0.1, unit="mm"),
     Bar("not_joined", equals=0),
     Bar("speed_up_links_and_icp", at_least=1.6, unit="times"),
 )
@@ -138,12 +137,11 @@ def _measure(args: Options, folder: Path) -> dict[str, Any]:
     report |= {"one_process": one, "workers": quiet, "workers_killed": broken}
     speed_up = _seconds_of(one, *_PARALLEL) / _seconds_of(quiet, *_PARALLEL)
     apart_m = _apart_m(killed.merged.version, _merge(folder, "one"))
-    single_m = _apart_m(_merge(folder, "one"), _merge(folder, "single"))
     report |= {
         "links": len(two.links), "clouds_aligned": len(two.tiles),
         "speed_up_links_and_icp": round(speed_up, 3),
         "speed_up_whole": round(one["seconds"] / quiet["seconds"], 3),
-        "apart_mm": round(1e3 * apart_m, 6), "apart_of_one_level_mm": round(1e3 * single_m, 6),
+        "apart_mm": round(1e3 * apart_m, 6),
         "links_and_clouds_equal": one["digest"] == quiet["digest"] == broken["digest"],
         "not_joined": args.copies - len(killed.merged.joined),
     }  # fmt: skip
@@ -161,10 +159,6 @@ def merge_in_one_process(folder_name: str, candidates: str) -> None:
     seconds = time.monotonic() - began
     (folder / "one.map").write_bytes(encode_map(result.merged.version))
     (folder / "one.json").write_text(json.dumps(_figures(result, seconds)), encoding="utf-8")
-    single = BatchMerge(
-        store, InProcessEngine(store), PlatformSettings(), options=options, two_levels=False
-    ).run(names)  # fmt: skip
-    (folder / "single.map").write_bytes(encode_map(single.merged.version))
 
 
 def _in_workers(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.extensions.batch.cluster import DaskEngine
 from rse_pf.extensions.batch.parts import Part, PartResult, delete_parts, is_done, put_input, read_result
-from rse_pf.extensions.batch.tasks import graph_arrays, links_of, strongest_rows
-from rse_pf.extensions.batch.two_levels import graph_between, graphs_within, poses_of_levels, stacked
+from rse_pf.extensions.batch.tasks import links_of, strongest_rows
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.service import Report
@@ -29,14 +28,9 @@ from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.loop_closures import Atlas, LoopProposals, MergeOptions, RejectionCounts, map_pair_of
 from rse_pf.slam.map_merge import MergedMap, MergeSteps, merge_versions
 from rse_pf.slam.optimise import (
-    OptimisedGraph,
-    OptimiseOptions,
     ignore_progress,
-    optimise_graph,
-    robust_cost,
 )
 from rse_pf.slam.ply import Colours, Points
-from rse_pf.slam.pose_graph import PoseGraph, connected_components
 from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
@@ -44,12 +38,12 @@ __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 # Progress, as a fraction of the whole merge, at which each kind of part begins.
 _SHARES = {
     "vectors": 0.0, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
-    "optimise": 0.88, "cloud": 0.95,
+    "cloud": 0.95,
 }  # fmt: skip
 # Each kind of part in the text of the progress.
 _DOING = {
     "vectors": "views of maps", "pairs": "proposals", "links": "parts of links",
-    "agree": "pairs of maps", "tiles": "pairs of clouds", "optimise": "pose graphs", "cloud": "clouds",
+    "agree": "pairs of maps", "tiles": "pairs of clouds", "cloud": "clouds",
 }  # fmt: skip
 MAX_MAPS = 256
 """Largest number of maps of one merge."""
@@ -93,7 +87,6 @@ class BatchMerge:
         *,
         options: MergeOptions | None = None,
         align_clouds: bool = True,
-        two_levels: bool = True,
     ) -> None:
         """Describe the merge; nothing is computed.
 
@@ -104,14 +97,12 @@ class BatchMerge:
             settings: Settings of the platform, with the size of parts (``batch.pairs_per_part``).
             options: Options of the merge; None means the defaults.
             align_clouds: Whether overlapping clouds are aligned, which gives more loop closures.
-            two_levels: Whether the pose graph of each map is optimised on its own before the whole graph.
         """
         self._store = store
         self._engine = engine
         self._settings = settings
         self._options = options or MergeOptions()
         self._align_clouds = align_clouds
-        self._two_levels = two_levels
         self._report: Report = ignore_progress
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._maps: tuple[str, ...] = ()
@@ -121,7 +112,6 @@ class BatchMerge:
         self._agreeing: list[Part] = []
         self._pairs: list[tuple[int, int]] = []
         self._computed = self._found = 0
-        self._progress = 0.0
 
     def run(self, maps: Sequence[str], report: Report = ignore_progress) -> BatchMergeResult:
         """Merge the maps in the objects *maps* and return the result.
@@ -138,10 +128,7 @@ class BatchMerge:
         self._maps = tuple(maps)
         self._report = report
         versions = self._versions()
-        steps = MergeSteps(
-            propose=self._propose, select=self._select, align=self._align, optimise=self._optimise,
-            deform=self._deform,
-        )  # fmt: skip
+        steps = MergeSteps(propose=self._propose, select=self._select, align=self._align, deform=self._deform)
         merged = merge_versions(versions, self._options, report=self._whole_report, steps=steps)
         return BatchMergeResult(
             merged=merged, links=self._links, tiles=tuple(self._tiles), computed=self._computed,
@@ -193,9 +180,7 @@ class BatchMerge:
 
         def on_done(count: int) -> None:
             share = (known + count) / len(parts)
-            # Pose graphs are computed in three rounds: the progress must not go back with each.
-            self._progress = max(self._progress, begin + share * (end - begin))
-            self._report(self._progress, f"{known + count} of {len(parts)} {_DOING[kind]}")
+            self._report(begin + share * (end - begin), f"{known + count} of {len(parts)} {_DOING[kind]}")
 
         on_done(0)
         self._own += [part.name for part in parts]
@@ -312,42 +297,6 @@ class BatchMerge:
             for link in links_of(result)
         ]
         return list(self._tiles)
-
-    def _optimise(
-        self, graph: PoseGraph, of_map: npt.NDArray[np.int64], options: OptimiseOptions
-    ) -> OptimisedGraph:
-        if not self._two_levels:
-            began = time.monotonic()
-            whole = optimise_graph(graph, options)
-            self._seconds["optimise"] += time.monotonic() - began
-            return whole
-        within = graphs_within(graph, of_map)
-        with_edges = [inner for _, inner in within if len(inner.a)]
-        levels = iter(self._run([self._optimising(inner, options) for inner in with_edges]))
-        solved = [
-            (rows, next(levels).arrays["poses"] if len(inner.a) else inner.T_world_pose)
-            for rows, inner in within
-        ]
-        poses = stacked(solved, len(of_map))
-        body, between = graph_between(graph, of_map, poses)
-        if len(between.a):
-            bodies = self._run([self._optimising(between, options)])[0].arrays["poses"]
-            poses = poses_of_levels(body, bodies, poses)
-        found = poses
-        if len(graph.a):
-            start = self._optimising(replace(graph, T_world_pose=poses), options)
-            found = self._run([start])[0].arrays["poses"]
-        return OptimisedGraph(
-            T_world_pose=found,
-            cost_before=robust_cost(graph, graph.T_world_pose, options.cauchy) if len(graph.a) else 0.0,
-            cost_after=robust_cost(graph, found, options.cauchy) if len(graph.a) else 0.0,
-            components=len(np.unique(connected_components(len(of_map), graph.a, graph.b))),
-        )
-
-    def _optimising(self, graph: PoseGraph, options: OptimiseOptions) -> Part:
-        name = self._put(**graph_arrays(graph))
-        plain = {"cauchy": options.cauchy, "max_iterations": options.max_iterations}
-        return Part(kind="optimise", inputs=(name,), arguments={"options": plain})
 
     def _deform(
         self, versions: Sequence[MapVersion], atlas: Atlas, poses: Array, rows: npt.NDArray[np.int64]

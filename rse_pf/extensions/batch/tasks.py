@@ -30,15 +30,11 @@ from rse_pf.slam.loop_closures import (
     measure_pairs,
     select_consistent,
 )
-from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, PlaceIndex, place_vector
-from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.storage.object_store import ObjectStore
 
 __all__ = [
     "compute_part",
-    "graph_arrays",
-    "graph_of",
     "link_arrays",
     "links_of",
     "strongest_rows",
@@ -100,23 +96,6 @@ def strongest_rows(links: Sequence[LoopClosure], most: int) -> list[int]:
     return sorted(row for _, _, row in sorted(ranked)[:most])
 
 
-def graph_arrays(graph: PoseGraph) -> dict[str, npt.NDArray[Any]]:
-    """Return the poses and edges of a pose graph as arrays."""
-    return {
-        "poses": graph.T_world_pose, "a": graph.a, "b": graph.b, "T_a_b": graph.T_a_b,
-        "information": graph.information, "robust": graph.robust.astype(np.uint8),
-    }  # fmt: skip
-
-
-def graph_of(result: PartResult) -> PoseGraph:
-    """Return the pose graph in the arrays of *result*, which `graph_arrays` made."""
-    of = result.arrays
-    return PoseGraph(
-        T_world_pose=of["poses"], a=of["a"], b=of["b"], T_a_b=of["T_a_b"], information=of["information"],
-        robust=of["robust"].astype(np.bool_), ids=np.arange(len(of["poses"])),
-    )  # fmt: skip
-
-
 def _vectors(store: ObjectStore, part: Part) -> PartResult:
     """Compute the place-recognition vector of each keyframe of a map: array ``vectors``."""
     atlas = _atlas(store, part, 1)
@@ -171,17 +150,6 @@ def _tiles(store: ObjectStore, part: Part) -> PartResult:
     return PartResult(arrays=link_arrays(links), counts=dict(refused))
 
 
-def _optimise(store: ObjectStore, part: Part) -> PartResult:
-    """Optimise a pose graph, starting at its poses: arrays ``poses`` and ``costs`` (before and after)."""
-    graph = graph_of(read_result(store, part.inputs[0]))
-    options = msgspec.convert(part.arguments["options"], OptimiseOptions)
-    found = optimise_graph(graph, options, chordal=False)
-    return PartResult(
-        arrays={"poses": found.T_world_pose, "costs": np.array([found.cost_before, found.cost_after])},
-        counts={"components": found.components},
-    )
-
-
 def _cloud(store: ObjectStore, part: Part) -> PartResult:
     """Move the points of a map's cloud with its keyframes to the optimised poses: array ``points``."""
     atlas = _atlas(store, part, 1)
@@ -197,7 +165,6 @@ _KINDS: dict[str, Callable[[ObjectStore, Part], PartResult]] = {
     "links": _links,
     "agree": _agree,
     "tiles": _tiles,
-    "optimise": _optimise,
     "cloud": _cloud,
 }
 
