@@ -14,7 +14,7 @@ from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.extensions.fleet_page import clouds
-from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, RobotPaths
+from rse_pf.extensions.fleet_page.feeds.live_feed import SCOPES, histories
 from rse_pf.extensions.fleet_page.feeds.platform_feed import (
     LocalFeed,
     fleet_document,
@@ -42,31 +42,22 @@ def test_every_text_of_the_fleet_is_escaped() -> None:
     assert json.loads(json.dumps(told)) == told
 
 
-def flat(x: float, angle: float = 0.0) -> list[float]:
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    T[0, 3] = x
-    return [float(each) for each in T.ravel()]
+def test_the_path_of_a_robot_has_a_part_for_each_segment_and_no_line_break_in_its_name() -> None:
+    points = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
+    paths = [
+        {"robot": "a\n", "points": points},
+        {"robot": "b", "points": points[:1]},
+        {"robot": "a\n", "points": points[:1]},
+    ]
 
+    told = histories(paths)
 
-def test_the_path_of_a_robot_lies_in_its_odometry_frame_so_that_corrections_move_all_of_it() -> None:
-    paths = RobotPaths()
-    aligned = {
-        "kind": "alignment",
-        "robot": "a",
-        "segment": 0,
-        "aligned": True,
-        "T_map_odom": flat(10.0, np.pi / 2),
+    assert told[r"a\n"] == {
+        "kind": "history",
+        "robot": r"a\n",
+        "parts": [points.tolist(), points[:1].tolist()],
     }
-    pose = {"kind": "pose", "robot": "a", "segment": 0, "T_map_camera": flat(12.0)}
-
-    assert paths.take(pose) is None  # not aligned yet
-    paths.take(aligned)
-    told = paths.take(pose)
-
-    assert told is not None
-    np.testing.assert_allclose(told["points"], [[0.0, -2.0, 0.0]], atol=1e-3)
-    assert paths.take({**pose, "segment": 1}) is None
+    assert told["b"]["parts"] == [points[:1].tolist()]
 
 
 def test_answer_times_are_known_after_two_readings_that_nobody_asked_for(

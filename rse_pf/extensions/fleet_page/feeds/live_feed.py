@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -23,7 +22,7 @@ from rse_pf.local.firewall import read_key
 from rse_pf.local.state import PlatformState, platform_settings, read_state
 from rse_pf.terminal import printable
 
-__all__ = ["LIVE", "SCOPES", "LiveFeed", "RobotPaths", "histories", "plain"]
+__all__ = ["LIVE", "SCOPES", "LiveFeed", "histories", "plain"]
 
 LIVE = "live/"
 # Name of the robot in the feed's token.
@@ -38,8 +37,6 @@ _CHECK_PAGES_S = 0.5
 _LIST_EVERY_S = 3.0
 # Largest number of live maps of a tenant that are listed.
 _MAX_MAPS = 8
-# Largest number of positions in the path of a robot; above it, the oldest are dropped.
-_MAX_PATH = 2000
 # Time between two readings of the paths of a live map, in seconds.
 _HISTORY_EVERY_S = 3.0
 
@@ -130,65 +127,8 @@ class LiveFeed:
             await asyncio.sleep(_HISTORY_EVERY_S)
 
     async def _follow_updates(self, robot: Any, label: str) -> None:
-        paths = RobotPaths()
         async for key, value in robot.subscribe(LIVE + split_label(label)[1]):
-            message = plain(value)
-            self._hub.put(LIVE + label, printable(str(key)), message)
-            path = paths.take(message)
-            if path is not None:
-                self._hub.put(LIVE + label, f"path/{message['robot']}", path)
-
-
-class RobotPaths:
-    """The path of each robot of a live map in its odometry frame, which corrections of the map move.
-
-    Positions are in metres.  The path of a robot without metric scale is rescaled when the map finds another
-    scale.
-    """
-
-    def __init__(self) -> None:
-        """Start without robots."""
-        self._T_map_odom: dict[str, tuple[Any, Any]] = {}
-        self._scales: dict[str, tuple[Any, float]] = {}
-        self._paths: dict[str, dict[str, Any]] = {}
-
-    def take(self, value: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Process *value*, an alignment or pose of a robot; return the robot's path if a position was added.
-
-        None for all other values, and for a pose before the alignment of its segment.
-        """
-        robot, segment = str(value.get("robot", "")), value.get("segment")
-        T_map_odom, T_map_camera = value.get("T_map_odom"), value.get("T_map_camera")
-        if value.get("kind") == "alignment" and value.get("aligned") and _is_matrix(T_map_odom):
-            self._T_map_odom[robot] = (segment, T_map_odom)
-            self._stretch(robot, segment, value.get("scale"))
-        known = self._T_map_odom.get(robot)
-        if (
-            value.get("kind") != "pose"
-            or known is None
-            or known[0] != segment
-            or not _is_matrix(T_map_camera)
-        ):
-            return None
-        assert isinstance(T_map_camera, list)
-        path = self._paths.get(robot)
-        if path is None or path["segment"] != segment:
-            path = self._paths[robot] = {"segment": segment, "points": []}
-        path["points"] = [*path["points"], _position_in_odometry(known[1], T_map_camera)][-_MAX_PATH:]
-        return path
-
-    def _stretch(self, robot: str, segment: Any, scale: Any) -> None:
-        """Store *scale*, the metres per unit of a robot's segment, and rescale the path by its change.
-
-        A value that is no positive number is ignored.
-        """
-        if not isinstance(scale, float) or not 0.0 < scale < math.inf:
-            return
-        before, path = self._scales.get(robot), self._paths.get(robot)
-        self._scales[robot] = segment, scale
-        if before is not None and path is not None and before[0] == segment == path["segment"]:
-            stretch = scale / before[1]
-            path["points"] = [[stretch * each for each in point] for point in path["points"]]
+            self._hub.put(LIVE + label, printable(str(key)), plain(value))
 
 
 def histories(paths: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -213,18 +153,6 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return [plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _is_matrix(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 16
-
-
-def _position_in_odometry(T_map_odom: Sequence[float], T_map_camera: Sequence[float]) -> list[float]:
-    """Return the position ``(3,)`` (m) of the camera in the odometry frame; both poses are 16 numbers."""
-    moved = [T_map_camera[4 * row + 3] - T_map_odom[4 * row + 3] for row in range(3)]
-    return [
-        round(sum(T_map_odom[4 * row + column] * moved[row] for row in range(3)), 4) for column in range(3)
-    ]
 
 
 def _token(state: PlatformState, settings: PlatformSettings, tenant: str) -> str:

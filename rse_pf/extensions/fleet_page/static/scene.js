@@ -3,7 +3,7 @@
 
 import { Cloud } from "./cloud.js";
 import {
-  Box3, BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial,
+  Box3, BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Mesh, MeshBasicMaterial,
   PerspectiveCamera, Points, PointsMaterial, Scene, SphereGeometry, Spherical, Vector3, WebGLRenderer,
 } from "./vendor/three.module.js";
 
@@ -179,17 +179,13 @@ export class MapScene {
     }
     for (const [, value] of state) {
       if (value.kind !== "alignment" || !value.aligned || !value.T_map_odom) continue;
-      const T = new Matrix4().set(...value.T_map_odom);
-      const path = state.get(`path/${value.robot}`);
-      const points = path && path.segment === value.segment ? path.points.map((each) => new Vector3(...each).applyMatrix4(T)) : [];
-      this.colour(value.robot);
-      if (points.length) this.moving.add(...this.drive(points, this.colour(value.robot)));
       const pose = state.get(`pose/${value.robot}`);
-      const at = pose ? new Vector3(pose.T_map_camera[3], pose.T_map_camera[7], pose.T_map_camera[11]) : points[points.length - 1];
-      if (!at) continue;
+      if (!pose) continue;
+      const at = new Vector3(pose.T_map_camera[3], pose.T_map_camera[7], pose.T_map_camera[11]);
+      this.colour(value.robot);
       this.place(value.robot, at);
       this.moving.add(this.robot(at, this.colour(value.robot), value.covariance));
-      reach.push(at, ...points);
+      reach.push(at);
     }
     if (reach.length) {
       if (!this.hasCloud && !this.isTurned) { this.turnUp(new Vector3(0, -1, 0)); this.isTurned = true; }
