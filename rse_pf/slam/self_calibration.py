@@ -14,6 +14,7 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, DegenerateGeometry
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, skew
 from rse_pf.slam.schur import NormalEquations, ReducedEquations
+from rse_pf.slam.triangulation import sum_by_index, triangulate_rays
 
 __all__ = [
     "UNKNOWNS",
@@ -222,15 +223,10 @@ def triangulate_landmarks(observed: DriveObservations, T_camera_world: Array, co
         has_depth, np.square(observed.depth_deviations_m, where=has_depth, out=np.ones(len(T))), 1.0
     )
     points_at_depth = centres + np.nan_to_num(observed.depths_m)[:, None] * rotated
-    unit = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
-    across_ray = np.eye(3) - unit[:, :, None] * unit[:, None, :]
-    A = _sum_by_index(across_ray, observed.landmarks, count)
-    b = _sum_by_index(np.einsum("nij,nj->ni", across_ray, centres), observed.landmarks, count)
     depth_weights: Array = np.where(has_depth, 1.0 / variances, 0.0)
-    A += _sum_by_index(depth_weights[:, None, None] * np.eye(3), observed.landmarks, count)
-    b += _sum_by_index(depth_weights[:, None] * points_at_depth, observed.landmarks, count)
-    points = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
-    return points.astype(np.float64, copy=False)
+    return triangulate_rays(
+        centres, rotated, np.ones(len(T)), points_at_depth, depth_weights, observed.landmarks, count
+    )
 
 
 def adjust_with_calibration(
@@ -597,9 +593,9 @@ class _DriveSystem:
             g[poses_size:] += J_shared.T @ r
         J_points_T = J_points.transpose(0, 2, 1)
         E[self._E_indices] = J_points_T @ J_keyframe
-        E[:, :, poses_size:] = _sum_by_index(J_points_T @ J_values, self.landmarks, landmark_count)
-        equations.H_landmarks = _sum_by_index(J_points_T @ J_points, self.landmarks, landmark_count)
-        equations.g_landmarks = _sum_by_index(
+        E[:, :, poses_size:] = sum_by_index(J_points_T @ J_values, self.landmarks, landmark_count)
+        equations.H_landmarks = sum_by_index(J_points_T @ J_points, self.landmarks, landmark_count)
+        equations.g_landmarks = sum_by_index(
             (J_points_T @ self._r[:, :, None])[:, :, 0], self.landmarks, landmark_count
         )
 
@@ -721,7 +717,7 @@ class _DriveSystem:
         # 3. Add the relative excess of each clustered variance over that for independent residuals.
         inflation = np.ones(len(rows))
         for clusters, count in clusterings:
-            sums = _sum_by_index(influence, clusters, count)
+            sums = sum_by_index(influence, clusters, count)
             clustered = (sums**2).sum(axis=0) * count / max(1, count - 1)
             inflation += np.maximum(clustered / np.maximum(variances, 1e-30) - 1.0, 0.0)
         return inflation
@@ -770,10 +766,3 @@ def rms_after_alignment(positions: Array, moved: Array, *, has_metric_scale: boo
     flat = moved.reshape(-1)
     remaining = flat - J @ np.linalg.lstsq(J, flat, rcond=None)[0]
     return float(np.sqrt((remaining**2).sum() / len(centred)))
-
-
-def _sum_by_index(values: Array, indices: Rows, count: int) -> Array:
-    """Return the sums ``(count, ...)`` of those values ``(n, ...)`` that have the same index ``(n,)``."""
-    flat = values.reshape(len(values), -1)
-    total = np.stack([np.bincount(indices, column, count) for column in flat.T], axis=1)
-    return total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])

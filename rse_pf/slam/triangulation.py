@@ -1,13 +1,15 @@
-"""Triangulation of points from two views of one camera, and reprojection errors."""
+"""Triangulation of points from two views of one camera or from rays of many, and reprojection errors."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, transform
 
-__all__ = ["parallax_deg", "reprojection_errors", "triangulate"]
+__all__ = ["parallax_deg", "reprojection_errors", "sum_by_index", "triangulate", "triangulate_rays"]
 
 _MIN_DEPTH = 1e-3
 """Smallest depth of a point before a camera, in the unit of the poses.  A nearer point, whose projection is
@@ -62,6 +64,47 @@ def triangulate(
         errors_px = np.linalg.norm(camera.project(camera_points) - pixels, axis=1)
         is_accepted &= is_ahead & (errors_px <= max_error_px)
     return points, is_accepted
+
+
+def triangulate_rays(
+    centres: Array,
+    rays: Array,
+    ray_weights: Array,
+    measured: Array,
+    measured_weights: Array,
+    landmarks: npt.NDArray[np.int64],
+    count: int,
+) -> Array:
+    """Return the positions ``(count, 3)`` of landmarks, by linear least squares in the unit of *centres*.
+
+    Each of *n* observations pulls its landmark to its ray and to its measured point, with weights that are
+    inverse variances of their distances; 0 leaves the ray or the point out.  A landmark without both gets the
+    origin of the world.
+
+    Args:
+        centres: ``(n, 3)``, positions of the cameras in the world.
+        rays: ``(n, 3)``, directions of the rays in the world, of any length.
+        ray_weights: ``(n,)``.
+        measured: ``(n, 3)``, in the world.
+        measured_weights: ``(n,)``.
+        landmarks: ``(n,)``, the index of the landmark of each observation.
+        count: Number of landmarks.
+    """
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    across_ray = ray_weights[:, None, None] * (np.eye(3) - unit[:, :, None] * unit[:, None, :])
+    A = sum_by_index(across_ray, landmarks, count)
+    b = sum_by_index(np.einsum("nij,nj->ni", across_ray, centres), landmarks, count)
+    A += sum_by_index(measured_weights[:, None, None] * np.eye(3), landmarks, count)
+    b += sum_by_index(measured_weights[:, None] * measured, landmarks, count)
+    points = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
+    return points.astype(np.float64, copy=False)
+
+
+def sum_by_index(values: Array, indices: npt.NDArray[np.int64], count: int) -> Array:
+    """Return the sums ``(count, ...)`` of those values ``(n, ...)`` that have the same index ``(n,)``."""
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
+    total = np.stack([np.bincount(indices, column, count) for column in flat.T], axis=1)
+    return total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])
 
 
 def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Array:

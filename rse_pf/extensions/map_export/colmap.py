@@ -15,11 +15,11 @@ from collections.abc import Callable
 import numpy as np
 
 from rse_pf.errors import UsageError
-from rse_pf.extensions.map_export.tracks import Tracks, find_tracks
+from rse_pf.extensions.map_export.tracks import Tracks, distinct_cameras, find_tracks
 from rse_pf.geometry import Camera, inverse, to_quaternion
 from rse_pf.maps.format import MapVersion
 
-__all__ = ["PIXEL_CENTRE", "distinct_cameras", "encode_colmap"]
+__all__ = ["PIXEL_CENTRE", "encode_colmap"]
 
 PIXEL_CENTRE = 0.5
 """Coordinate in pixels of the centre of the upper left pixel in COLMAP and nerfstudio; 0 in a map."""
@@ -55,11 +55,6 @@ def encode_colmap(
             "# POINT3D_ID X Y Z R G B ERROR, and IMAGE_ID POINT2D_IDX", *_point_lines(tracks)
         ),
     }
-
-
-def distinct_cameras(version: MapVersion) -> list[Camera]:
-    """Return the different cameras of a map's keyframes, in the order in which they first occur."""
-    return list(dict.fromkeys(keyframe.camera for keyframe in version.keyframes))
 
 
 def _camera_line(number: int, camera: Camera) -> str:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from rse_pf.errors import UsageError
-from rse_pf.extensions.map_export.colmap import PIXEL_CENTRE, distinct_cameras
+from rse_pf.extensions.map_export.colmap import PIXEL_CENTRE
+from rse_pf.extensions.map_export.tracks import distinct_cameras
 from rse_pf.geometry import Array, Camera, transform
 from rse_pf.maps.format import IMAGES_FOLDER, MapVersion
 from rse_pf.slam.inertial import upright_rotation

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, inverse, transform
+from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.pose_graph import connected_components
 from rse_pf.slam.relative_pose import RelativePoseOptions, match_descriptors
+from rse_pf.slam.triangulation import reprojection_errors, triangulate_rays
 
-__all__ = ["Tracks", "find_tracks"]
+__all__ = ["Tracks", "distinct_cameras", "find_tracks"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -28,7 +29,7 @@ _NEXT_KEYFRAMES = 3
 _OUTLIER_PX = 4.0
 """Largest reprojection error in pixels of a match and of an observation, and the width of the Huber loss of
 the triangulation; COLMAP filters its own models by the same limit."""
-_GAUSS_NEWTON_STEPS = 3  # steps of each triangulation of the points
+_ROUNDS = 4  # rounds of each triangulation: one by measured points alone, and three with pixels
 _OUTLIER_ROUNDS = 2
 """Number of rounds, each of which triangulates the points and then removes outliers; one more triangulation
 follows the last round."""
@@ -98,21 +99,26 @@ def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda do
     for _ in range(_OUTLIER_ROUNDS):
         row = _keep_observed_twice(features, row, roots)
         point = _number_runs(roots[row])
-        points = _triangulate(version, features, row, point)
-        error_px = _reprojection_errors(version, features, row, points[point])
+        points = _triangulate(features, row, point)
+        error_px, _ = _reproject(features, row, points[point])
         row = _remove_outliers(features, row, point, error_px)
     # 3. Triangulate the points again from the observations that are left.
     row = _keep_observed_twice(features, row, roots)
     point = _number_runs(roots[row])
-    points = _triangulate(version, features, row, point)
+    points = _triangulate(features, row, point)
     return Tracks(
         points=points,
         colours=_colours(version, points),
         point=point,
         keyframe=features.keyframe[row],
         feature=row - features.starts[features.keyframe[row]],
-        error_px=_reprojection_errors(version, features, row, points[point]),
+        error_px=_reproject(features, row, points[point])[0],
     )
+
+
+def distinct_cameras(version: MapVersion) -> list[Camera]:
+    """Return the different cameras of a map's keyframes, in the order in which they first occur."""
+    return list(dict.fromkeys(keyframe.camera for keyframe in version.keyframes))
 
 
 def _keyframe_pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
@@ -178,7 +184,12 @@ class _Features:
     Attributes:
         starts: ``(k + 1,)``, the first row of the features of each keyframe, and *n*.
         keyframe: ``(n,)``, the index of the keyframe of each feature.
+        cameras: The different cameras of the keyframes.
+        camera: ``(n,)``, the index of the camera of each feature.
+        T_camera_world: ``(k, 4, 4)``, the poses of the keyframes.
         pixel: ``(n, 2)``, undistorted.
+        ray: ``(n, 3)``, the point of the feature at a depth of 1 in the frame of its camera.
+        focal_px: ``(n,)``, the geometric mean of the focal lengths along x and y.
         measured_point: ``(n, 3)`` metres, the point that the depth of the feature gives, in the world; 0 if
             unknown.
         weight: ``(n,)``, the information of this point along each axis in 1/m^2: the inverse variance of the
@@ -187,7 +198,12 @@ class _Features:
 
     starts: Rows
     keyframe: Rows
+    cameras: list[Camera]
+    camera: Rows
+    T_camera_world: Array
     pixel: Array
+    ray: Array
+    focal_px: Array
     measured_point: Array
     weight: Array
 
@@ -196,17 +212,28 @@ def _collect_features(version: MapVersion) -> _Features:
     counts = [len(keyframe.pixels) for keyframe in version.keyframes]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     n = starts[-1]
-    pixel, measured_point, weight = np.empty((n, 2)), np.zeros((n, 3)), np.zeros(n)
+    pixel, ray, measured_point, weight = np.empty((n, 2)), np.empty((n, 3)), np.zeros((n, 3)), np.zeros(n)
     for start, keyframe in zip(starts, version.keyframes, strict=False):
-        pixel[start : start + len(keyframe.pixels)] = keyframe.pixels
+        own = slice(start, start + len(keyframe.pixels))
+        pixel[own] = keyframe.pixels
+        ray[own] = keyframe.camera.back_project(pixel[own], np.ones(len(keyframe.pixels)))
         rows = _rows_with_point(keyframe)
         points = keyframe.points_camera[rows].astype(np.float64)
         measured_point[start + rows] = transform(keyframe.T_world_camera, points)
         weight[start + rows] = 1.0 / _DEPTH_NOISE.variance_m2(points[:, 2])
+    cameras = distinct_cameras(version)
+    number_of = {camera: number for number, camera in enumerate(cameras)}
+    keyframe_camera = np.array([number_of[each.camera] for each in version.keyframes], dtype=np.int64)
+    camera = np.repeat(keyframe_camera, counts)
     return _Features(
         starts=starts,
         keyframe=np.repeat(np.arange(len(counts)), counts),
+        cameras=cameras,
+        camera=camera,
+        T_camera_world=np.array([inverse(each.T_world_camera) for each in version.keyframes]),
         pixel=pixel,
+        ray=ray,
+        focal_px=np.array([np.sqrt(each.fx * each.fy) for each in cameras])[camera],
         measured_point=measured_point,
         weight=weight,
     )
@@ -233,85 +260,47 @@ def _number_runs(sorted_roots: Rows) -> Rows:
     return np.concatenate([[0], np.cumsum(sorted_roots[1:] != sorted_roots[:-1])]).astype(np.int64)
 
 
-def _triangulate(version: MapVersion, features: _Features, row: Rows, point: Rows) -> Array:
+def _triangulate(features: _Features, row: Rows, point: Rows) -> Array:
     """Return the points ``(n, 3)`` in the world, metres, that fit the pixels and the measured points best.
 
-    Three Gauss-Newton steps start at the weighted mean of the measured points.  Residuals of pixels have a
-    standard deviation of 1 px and a Huber loss of 4 px; those of measured points have a quadratic loss.
+    Three rounds of reweighted least squares start at the weighted mean of the measured points.  Pixels have a
+    standard deviation of 1 px and a Huber loss of 4 px; measured points have a quadratic loss.
 
     Args:
-        version: The map.
         features: All features of the map.
         row: ``(m,)``, the observing features.
         point: ``(m,)``, the number of the point of each observation, ascending from 0 without gaps; each
             point has an observation with a measured point.
     """
     count = int(point[-1]) + 1 if len(point) else 0
-    # 1. Start each point at the mean of its measured points, weighted by their information.
-    weight = features.weight[row]
-    total_weight = np.bincount(point, weight, count)
-    measured = features.measured_point[row]
-    sums = [np.bincount(point, weight * measured[:, axis], count) for axis in range(3)]
-    points: Array = np.stack(sums, axis=1) / total_weight[:, None]
-    for _ in range(_GAUSS_NEWTON_STEPS):
-        # 2. Compute residuals and Jacobians of the pixels, with the square roots of the Huber weights.
-        residual, jacobian = _residuals(version, features, row, points[point])
-        relative_error = np.linalg.norm(residual, axis=1) / _OUTLIER_PX
-        root_weight = 1.0 / np.sqrt(np.maximum(relative_error, 1.0))
-        residual, jacobian = root_weight[:, None] * residual, root_weight[:, None, None] * jacobian
-        # 3. Make the normal equations of each observation: of its pixel, and of its measured point.
-        H = np.einsum("mki,mkj->mij", jacobian, jacobian)
-        H += weight[:, None, None] * np.eye(3)
-        right = weight[:, None] * (measured - points[point])
-        right += np.einsum("mki,mk->mi", jacobian, residual)
-        # 4. Sum the normal equations of the observations of each point, and move the point by their solution.
-        starts = np.flatnonzero(np.diff(point, prepend=-1))
-        if count:
-            left = np.add.reduceat(H, starts)
-            points = points + np.linalg.solve(left, np.add.reduceat(right, starts)[..., None])[..., 0]
+    keyframe = features.keyframe[row]
+    centres = inverse(features.T_camera_world)[keyframe, :3, 3]
+    rays = np.einsum("mji,mj->mi", features.T_camera_world[keyframe, :3, :3], features.ray[row])
+    ray_weights = np.zeros(len(row))
+    for _ in range(_ROUNDS):
+        points = triangulate_rays(
+            centres, rays, ray_weights, features.measured_point[row], features.weight[row], point, count
+        )
+        error_px, depth_m = _reproject(features, row, points[point])
+        # A pixel is depth over focal length wide.  Behind a camera the error is infinite, and the weight 0.
+        information = np.square(features.focal_px[row] / np.maximum(depth_m, _MIN_DEPTH_M))
+        ray_weights = information / np.maximum(error_px / _OUTLIER_PX, 1.0)
     return points
 
 
-def _residuals(version: MapVersion, features: _Features, row: Rows, points: Array) -> tuple[Array, Array]:
-    """Return the pixels minus the projected points ``(m, 2)``, and the Jacobians of the projections.
-
-    The Jacobians ``(m, 2, 3)`` are derivatives of the projected points by the points in the world, in pixels
-    per metre.  Residual and Jacobian are 0 where a point is not more than 5 cm in front of its camera.
-
-    Args:
-        version: The map.
-        features: All features of the map.
-        row: ``(m,)``, the observing features.
-        points: ``(m, 3)``, the point of each observation in the world.
-    """
-    keyframes = version.keyframes
-    T_camera_world = np.array([inverse(k.T_world_camera) for k in keyframes]).reshape(-1, 4, 4)
-    intrinsics = np.array([(k.camera.fx, k.camera.fy, k.camera.cx, k.camera.cy) for k in keyframes])
-    intrinsics = intrinsics.reshape(-1, 4)
-    index = features.keyframe[row]
-    rotation = T_camera_world[index, :3, :3]
-    points_camera = np.einsum("mij,mj->mi", rotation, points) + T_camera_world[index, :3, 3]
-    is_ahead = points_camera[:, 2] > _MIN_DEPTH_M
-    z = np.where(is_ahead, points_camera[:, 2], 1.0)
-    focal, centre = intrinsics[index, :2], intrinsics[index, 2:]
-    residual = features.pixel[row] - (focal * points_camera[:, :2] / z[:, None] + centre)
-    by_point_camera = np.zeros((len(row), 2, 3))
-    by_point_camera[:, 0, 0], by_point_camera[:, 1, 1] = focal[:, 0] / z, focal[:, 1] / z
-    by_point_camera[:, :, 2] = -focal * points_camera[:, :2] / (z * z)[:, None]
-    jacobian = np.einsum("mki,mij->mkj", by_point_camera, rotation)
-    residual[~is_ahead], jacobian[~is_ahead] = 0.0, 0.0
-    return residual, jacobian
-
-
-def _reprojection_errors(version: MapVersion, features: _Features, row: Rows, points: Array) -> Array:
-    """Return the reprojection errors ``(m,)`` in pixels; infinite where the point is behind the camera.
+def _reproject(features: _Features, row: Rows, points: Array) -> tuple[Array, Array]:
+    """Return reprojection errors ``(m,)``, pixels, infinite behind the camera, and depths ``(m,)``, metres.
 
     Row *i* of *points* ``(m, 3)``, in the world, is the point of the observing feature ``row[i]``.
     """
-    residual, jacobian = _residuals(version, features, row, points)
-    errors: Array = np.linalg.norm(residual, axis=1)
-    errors[~jacobian.any(axis=(1, 2))] = np.inf  # The Jacobian is 0 if the point is behind the camera.
-    return errors
+    error_px, depth_m = np.empty(len(row)), np.empty(len(row))
+    for number, camera in enumerate(features.cameras):
+        own = np.flatnonzero(features.camera[row] == number)
+        T_camera_world = features.T_camera_world[features.keyframe[row[own]]]
+        error_px[own], depth_m[own] = reprojection_errors(
+            T_camera_world, points[own], features.pixel[row[own]], camera
+        )
+    return error_px, depth_m
 
 
 def _remove_outliers(features: _Features, row: Rows, point: Rows, error_px: Array) -> Rows:
