@@ -73,6 +73,17 @@ def test_each_point_has_the_features_that_see_it_and_they_name_it() -> None:
             np.testing.assert_allclose(at, world[nearest.argmin()], atol=1e-5)
 
 
+def test_pixels_correct_measured_points_that_are_two_pixels_aside() -> None:
+    version, world = points_map()
+    aside = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.004, 0.0, 1.0]])  # the focal length is 500 px
+    moved = [replace(each, points_camera=each.points_camera @ aside) for each in version.keyframes]
+
+    tracks = find_tracks(replace(version, keyframes=tuple(moved)))
+
+    assert len(tracks.points) == len(world)
+    assert tracks.error_px.max() < 1.0
+
+
 def test_keyframes_far_apart_in_time_are_matched_where_an_edge_links_them() -> None:
     version, _ = points_map(keyframes=12)
     first, last = version.keyframes[0], version.keyframes[-1]
