@@ -32,7 +32,7 @@ import numpy as np
 from benchmarks.frame.registry import Bar, Recordings, benchmark, command_of
 from benchmarks.frame.report import say
 from rse_pf.config import PlatformSettings
-from rse_pf.extensions.batch.cluster import DaskEngine, LocalCluster
+from rse_pf.extensions.batch.dask_engine import DaskEngine, LocalCluster
 from rse_pf.extensions.batch.merge import BatchMerge, BatchMergeResult
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, decode_map, encode_map

@@ -13,7 +13,7 @@ import numpy as np
 
 from client_sdk.check.calibration import CalibrationCheck, check_calibration
 from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Finding, order
-from client_sdk.check.images import FrameStatistics
+from client_sdk.check.frames import FrameStatistics
 from client_sdk.check.keyframes import KeyframeStore
 from client_sdk.check.motion import (
     MIN_ADJUSTED_KEYFRAMES,

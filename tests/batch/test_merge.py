@@ -12,8 +12,8 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected, LimitExceeded
 from rse_pf.extensions.batch.merge import BatchMerge, BatchMergeResult, strongest
+from rse_pf.extensions.batch.part_kinds import strongest_rows
 from rse_pf.extensions.batch.parts import PREFIX, Part
-from rse_pf.extensions.batch.tasks import strongest_rows
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_loop_closures

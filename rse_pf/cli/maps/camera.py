@@ -304,7 +304,7 @@ def check_camera(request: _CheckRequest, settings: PlatformSettings) -> int:
     """
     if request.frames < 2:
         raise UsageError(f"--frames {request.frames} is below 2", hint="60 is two seconds of a webcam")
-    from client_sdk.check.images import FrameStatistics
+    from client_sdk.check.frames import FrameStatistics
 
     stamps, statistics, size = [], FrameStatistics(), (0, 0)
     lengths: Counter[str] = Counter()

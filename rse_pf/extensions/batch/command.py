@@ -91,7 +91,7 @@ def merge_in_parts(request: MergeInPartsRequest, settings: PlatformSettings) -> 
     """Merge maps in parts and commit the merged map; return 1 if a map was not joined, else 0."""
     settings = request.settings_with_store(settings)
     require("batch run")
-    from rse_pf.extensions.batch.cluster import Cluster, DaskEngine, LocalCluster, RemoteCluster
+    from rse_pf.extensions.batch.dask_engine import Cluster, DaskEngine, LocalCluster, RemoteCluster
     from rse_pf.extensions.batch.merge import BatchMerge
     from rse_pf.services.mapping.merge import reply_of
     from rse_pf.slam.loop_closures import MergeOptions

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded
-from rse_pf.extensions.batch.cluster import DaskEngine
+from rse_pf.extensions.batch.dask_engine import DaskEngine
+from rse_pf.extensions.batch.part_kinds import links_of, strongest_rows
 from rse_pf.extensions.batch.parts import Part, PartResult, delete_parts, is_done, put_input, read_result
-from rse_pf.extensions.batch.tasks import links_of, strongest_rows
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.service import Report

@@ -23,8 +23,8 @@ from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, message_of
 from rse_pf.extensions.batch.listening import bound_handshakes, without_pages
+from rse_pf.extensions.batch.part_kinds import compute_part
 from rse_pf.extensions.batch.parts import decode_part
-from rse_pf.extensions.batch.tasks import compute_part
 from rse_pf.processes.ipc import encode_message, receive
 from rse_pf.storage.object_store import ObjectStore
 from rse_pf.terminal import show

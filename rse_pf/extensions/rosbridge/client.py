@@ -29,7 +29,7 @@ from rse_pf.errors import (
     UnknownService,
     UnsupportedProtocol,
 )
-from rse_pf.extensions.rosbridge.messages import Operation, read_head, read_operation, refusal, response
+from rse_pf.extensions.rosbridge.operations import Operation, read_head, read_operation, refusal, response
 from rse_pf.extensions.rosbridge.sender import TopicSender
 from rse_pf.extensions.rosbridge.topics import TopicClient, Topics
 from rse_pf.limits.budget import Budget

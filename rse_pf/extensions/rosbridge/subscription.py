@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from rse_pf.extensions.rosbridge.messages import publication
+from rse_pf.extensions.rosbridge.operations import publication
 
 __all__ = ["MAX_HELD_BYTES", "MAX_QUEUE_LENGTH", "HeldBytes", "Subscription", "TopicMessage"]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.errors import BadRequest, Conflict, Forbidden, QuotaExceeded, UnsupportedProtocol
-from rse_pf.extensions.rosbridge.messages import Operation
+from rse_pf.extensions.rosbridge.operations import Operation
 from rse_pf.extensions.rosbridge.sender import TopicSender
 from rse_pf.extensions.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
 

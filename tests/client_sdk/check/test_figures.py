@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from client_sdk.check.images import sharpness
+from client_sdk.check.frames import sharpness
 from client_sdk.check.keyframes import depths_at
 from tests.oracles import depths
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from client_sdk.check.findings import FaultKind, Finding
-from client_sdk.check.images import FrameStatistics
+from client_sdk.check.frames import FrameStatistics
 
 Image = npt.NDArray[np.uint8]
 FRAMES = 60

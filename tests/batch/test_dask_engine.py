@@ -14,7 +14,7 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Crashed
-from rse_pf.extensions.batch.cluster import DaskEngine, LocalCluster
+from rse_pf.extensions.batch.dask_engine import DaskEngine, LocalCluster
 from rse_pf.extensions.batch.merge import BatchMerge
 from rse_pf.extensions.batch.parts import Part
 from rse_pf.maps.format import MapVersion, encode_map
@@ -77,7 +77,7 @@ def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
     def compute(settings: bytes, part: bytes) -> None:
         os._exit(3)
 
-    monkeypatch.setattr("rse_pf.extensions.batch.cluster.compute", compute)
+    monkeypatch.setattr("rse_pf.extensions.batch.dask_engine.compute", compute)
     settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
     events: list[str] = []
     cluster = LocalCluster(1, part_tries=2)
