@@ -27,7 +27,10 @@ class MessageTap(Protocol):
         return 0
 
     def observe_message(self, connection: int, direction: Literal["up", "down"], data: bytes) -> None:
-        """Observe the bytes of one message: ``up`` from robot to server, ``down`` from server to robot."""
+        """Observe the bytes of one message: ``up`` from robot to server, ``down`` from server to robot.
+
+        *data* is the message as the WebSocket carries it; the first ones are the hello and the welcome.
+        """
         return
 
     def close_connection(self, connection: int) -> None:

@@ -84,9 +84,9 @@ def show_reply(
     name_of: Callable[[str], str],
     is_present: Callable[[str], bool],
 ) -> Payload:
-    """Return the reply of ``live-show``: the robots and the state of a live map.
+    """Return the reply of ``live-show``: the state of a live map, and all robots with keyframes in it.
 
-    Robots that have left are not listed.
+    ``present`` tells whether a robot contributes now, or has left.
 
     Args:
         robot: Robot that asks; the field ``you`` says how it numbers its next keyframe and segment.
