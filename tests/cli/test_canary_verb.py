@@ -58,7 +58,7 @@ def test_a_canary_whose_secret_is_gone_is_not_enrolled(
 
     assert main(["cloud", "canary"]) == 2
 
-    assert "put_secret_value: it does not exist" in capsys.readouterr().err
+    assert "put_secret_value: the resource does not exist" in capsys.readouterr().err
     assert AccessControlStore(S3Store(account.client("s3"), "artifacts")).roster().robots == ()
 
 
