@@ -50,7 +50,13 @@ def outcome(codec: Codec, data: bytes) -> tuple[str, bytes]:
         request = as_type({} if message.payload is None else message.payload, PnpRequest)
     except RsePfError as error:
         return f"request {error.message}", _encode(msgspec.structs.replace(message, payload=None))
-    return "request", _encode(msgspec.structs.replace(message, payload=request))
+    # msgspec leaves out a default by its identity, and an equal number may be another object.
+    options = None if request.options is None else msgspec.structs.asdict(request.options)
+    plain = {
+        name: value for name, value in msgspec.structs.asdict(request).items() if value is not msgspec.UNSET
+    }
+    plain["options"] = options
+    return "request", _encode(msgspec.structs.replace(message, payload=plain))
 
 
 def assert_alike(codec: str, data: bytes) -> None:
