@@ -112,6 +112,12 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError for the *message* of argparse; the hint names a similar option or word, if any."""
         choice = _CHOICE.search(message)
+        first = self.typed[0].partition("=")[0] if self.typed else ""
+        if choice and first in self._options_of_actions():
+            raise UsageError(
+                f"{self.prog}: {first} comes before the action",
+                hint=f"write {self.prog} ACTION, then the options",
+            )
         if choice:
             known = [word.strip(" '\"") for word in choice["known"].split(",")]
             raise UsageError(

@@ -89,10 +89,6 @@ class _BinaryCommand(Command, frozen=True, kw_only=True, tag="command", forbid_u
     payload: _BinaryRequest
 
 
-_COPIED_FIELDS = tuple(name for name in Command.__struct_fields__ if name != "payload")
-"""Fields of a command that its request does not change."""
-
-
 def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], Command | None] | None:
     """Return a function that decodes ``pnp`` commands of the encoding *codec*.
 
@@ -176,7 +172,16 @@ def _make_command(
         depths_m=depths_m,
         depth_noise=_validated(noise, DepthNoise) if isinstance(noise, _Noise) else noise,
     )
-    return Command(payload=request, **{name: getattr(command, name) for name in _COPIED_FIELDS})
+    return Command(
+        id=command.id,
+        service=command.service,
+        payload=request,
+        stream=command.stream,
+        seq=command.seq,
+        keep=command.keep,
+        deadline_ms=command.deadline_ms,
+        trace=command.trace,
+    )
 
 
 def _decode_array(extension: Ext) -> Array:

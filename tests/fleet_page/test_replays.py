@@ -21,4 +21,5 @@ def test_a_weak_pose_shows_its_matches_and_the_rules_that_it_broke(tmp_path: Pat
     assert told["picture"].startswith("data:image/png;base64,")
     broken = [line for line in told["lines"] if ", not at " in line]
     assert [line.partition(":")[0] for line in broken] == ["low-inlier-ratio"]
+    assert not any(" ," in line for line in told["lines"])
     assert told["lines"][0].startswith("verdict weak: low-inlier-ratio; engine ")

@@ -222,6 +222,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("camera board --out b.jpg", USAGE, "is no .pdf", "write board.pdf: it prints at its true size"),
     WrongInput("camera check 0 --frames 1", USAGE, "--frames 1 is below 2", "60 is two seconds of a webcam"),
     WrongInput("token isue robot-1", USAGE, "'isue' is not one of issue", "did you mean issue?"),
+    WrongInput("token --ttl 600 issue", USAGE, "--ttl comes before the action", "rse-pf token ACTION, then the options"),
     WrongInput("token issue", USAGE, "arguments are required: ROBOT", "rse-pf token issue --help"),
     WrongInput("token issue robot-1 --ttl 1e9", USAGE, "a time to live of 1e+09 s is not within 900 s", "auth.token_ttl_s"),
     WrongInput("token issue robot-1 --name other", USAGE, "cannot read the key", "start a platform with rse-pf local"),

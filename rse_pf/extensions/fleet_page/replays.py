@@ -110,7 +110,7 @@ def replay_document(report: CommandReport) -> dict[str, Any]:
         f"verdict {report.verdict}{reason}; engine {report.engine or '-'}",
         f"{report.inliers} inliers of {report.matches} matches, {report.rmse_px:.2f} px",
         *(
-            f"{rule.name}: {rule.about}: {rule.measured:.4g} {rule.unit}, not "
+            f"{rule.name}: {rule.about}: {f'{rule.measured:.4g} {rule.unit}'.rstrip()}, not "
             f"{'at least' if rule.at_least else 'at most'} {rule.limit:.4g}"
             for rule in report.rules
             if not rule.is_satisfied

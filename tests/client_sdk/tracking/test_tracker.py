@@ -139,6 +139,22 @@ def test_a_place_that_the_camera_cannot_have_reached_is_not_recognised_until_it_
     assert later.segment == 0
 
 
+@pytest.mark.parametrize("kind", [Tracker, MonocularTracker], ids=["depth", "one lens"])
+def test_a_segment_out_of_reach_is_joined_once_the_camera_has_moved_farther_than_the_places_are_apart(
+    kind: type[Tracker] | type[MonocularTracker],
+) -> None:
+    tracker = kind(FrontEndOptions(segment_after=3))
+    shown = functools.partial(frame_at, depth=kind is Tracker)
+    run_all(tracker, map(shown, range(35)))
+    back = [replace(shown(row), timestamp_s=3.5 + 0.1 * n) for n, row in enumerate(range(66, 2, -1))]
+
+    run_all(tracker, back[:31])
+    assert tracker.joins == []
+    run_all(tracker, back[31:])
+
+    assert [(join.segment, join.into) for join in tracker.joins] == [(1, 0)]
+
+
 def test_a_camera_that_moves_half_a_metre_between_two_images_is_tracked() -> None:
     tracker = Tracker()
 

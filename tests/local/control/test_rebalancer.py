@@ -30,3 +30,7 @@ def test_an_order_is_not_repeated_before_its_robots_had_time_to_move_and_then_it
 
     assert rebalancer.plan_orders(UNEVEN, 100.0 + longest_s) == {}
     assert rebalancer.plan_orders(UNEVEN, 100.0 + longest_s + 2.0) != {}
+
+
+def test_half_a_minute_after_a_change_no_robot_is_moved() -> None:
+    assert watching(UNEVEN).plan_orders(UNEVEN, 131.0) == {}
