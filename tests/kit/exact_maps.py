@@ -7,9 +7,9 @@ import functools
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.extensions.map_export.occupancy import OccupancyGrid
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.occupancy import OccupancyGrid
 
 __all__ = ["CAMERA", "OTHER_CAMERA", "plan_of_world", "points_map", "shares_right", "world_map"]
 
@@ -122,7 +122,7 @@ def shares_right(grid: OccupancyGrid, low_m: float, high_m: float) -> tuple[floa
 
     A free cell is correct if its centre is free in the world, an occupied cell if any part of it is occupied.
     """
-    from rse_pf.extensions.map_export.occupancy import FREE, OCCUPIED
+    from rse_pf.slam.occupancy import FREE, OCCUPIED
 
     fine, (height, width) = 5, grid.cells.shape
     step = grid.resolution_m / fine

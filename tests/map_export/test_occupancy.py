@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.extensions.map_export.occupancy import (
+from rse_pf.extensions.map_export.occupancy import encode_occupancy
+from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
+from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.level_surfaces import floor_normal
+from rse_pf.slam.occupancy import (
     FREE,
     OCCUPIED,
     UNKNOWN,
     GridOptions,
     OccupancyGrid,
-    encode_occupancy,
     make_occupancy_grid,
 )
-from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
-from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.slam.level_surfaces import floor_normal
 from tests.kit.exact_maps import CAMERA, shares_right, world_map
 
 UP = GridOptions(up=(0.0, 0.0, 1.0))

@@ -17,10 +17,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.colmap import encode_colmap
 from rse_pf.extensions.map_export.nerfstudio import encode_nerfstudio
-from rse_pf.extensions.map_export.occupancy import GridOptions, encode_occupancy, make_occupancy_grid
+from rse_pf.extensions.map_export.occupancy import encode_occupancy
 from rse_pf.extensions.map_export.single_files import SINGLE_FILE_FORMATS, encode_single_file
 from rse_pf.maps.format import IMAGES_FOLDER, MapVersion
 from rse_pf.maps.registry import MapRegistry
+from rse_pf.slam.occupancy import GridOptions, make_occupancy_grid
 from rse_pf.storage.files import read_regular_file, replace_file
 from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 
