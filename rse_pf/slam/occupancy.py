@@ -22,6 +22,7 @@ from rse_pf.slam.level_surfaces import UpSource, estimate_up
 
 __all__ = [
     "FREE",
+    "MAX_LINES_OF_SIGHT",
     "OCCUPIED",
     "UNKNOWN",
     "GridOptions",
@@ -40,7 +41,7 @@ grid; points beyond are left out of the floor plan, because no camera can have s
 _MAX_RAY_M = 10.0
 """Largest absolute coordinate in metres, in the camera's frame, of a feature whose line of sight marks cells
 as free: the depth of a farther one is inaccurate."""
-_MAX_RAYS = 400_000
+MAX_LINES_OF_SIGHT = 400_000
 """Largest number of lines of sight of a map that mark cells as free, divided equally among its keyframes;
 bounds the time of an export."""
 _RAYS_AT_ONCE = 20_000
@@ -134,8 +135,15 @@ class OccupancyGrid:
 _DEFAULT = GridOptions()
 
 
-def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) -> OccupancyGrid:
+def make_occupancy_grid(
+    version: MapVersion, options: GridOptions = _DEFAULT, *, max_lines: int = MAX_LINES_OF_SIGHT
+) -> OccupancyGrid:
     """Return the floor plan of a map; the same map and options always give the same grid.
+
+    Args:
+        version: The map, with keyframes and points.
+        options: Size of the cells, and heights of floor and robot.
+        max_lines: Largest number of lines of sight that mark cells as free; fewer take less time.
 
     Raises:
         UsageError: The map has no points or no keyframes, the direction against gravity is unknown, no point
@@ -170,7 +178,7 @@ def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) ->
     floor_points = points[np.abs(height_m) <= options.step_m]
     # 4. Mark the cells of floor points and lines of sight as free, then those of obstacles as occupied, which
     # replaces free.
-    start, end = _lines_of_sight(version, T_grid_camera, floor_m, options)
+    start, end = _lines_of_sight(version, T_grid_camera, floor_m, options, max_lines)
     raster = _Raster.covering([obstacles, floor_points, start, end], options)
     raster.mark_free(raster.cell_numbers(floor_points))
     raster.mark_lines_free(start, end)
@@ -235,10 +243,11 @@ def _find_floor(points: Array, T_grid_camera: Array, options: GridOptions) -> fl
     if not len(below):
         return float(points[:, 2].min())
     lowest_m = float(below[:, 2].min())
-    layer_cells = np.column_stack(
-        [np.floor((below[:, 2] - lowest_m) / _LAYER_M), np.floor(below[:, :2] / _AREA_CELL_M)]
-    ).astype(np.int64)
-    area = np.bincount(np.unique(layer_cells, axis=0)[:, 0])
+    layers = np.floor((below[:, 2] - lowest_m) / _LAYER_M).astype(np.int64)
+    squares = np.floor((below[:, :2] - below[:, :2].min(axis=0)) / _AREA_CELL_M).astype(np.int64)
+    columns, rows = squares.max(axis=0) + 1
+    distinct = np.unique((layers * columns + squares[:, 0]) * rows + squares[:, 1])
+    area = np.bincount(distinct // (columns * rows))
     layer = int(np.flatnonzero(area >= _FLOOR_SHARE * area.max())[0])
     middle_m = lowest_m + (layer + 0.5) * _LAYER_M
     near = below[np.abs(below[:, 2] - middle_m) <= _LAYER_M, 2]
@@ -246,7 +255,7 @@ def _find_floor(points: Array, T_grid_camera: Array, options: GridOptions) -> fl
 
 
 def _lines_of_sight(
-    version: MapVersion, T_grid_camera: Array, floor_m: float, options: GridOptions
+    version: MapVersion, T_grid_camera: Array, floor_m: float, options: GridOptions, max_lines: int
 ) -> tuple[Array, Array]:
     """Return starts and ends ``(n, 3)`` in metres of the lines from cameras to features, in the grid's frame.
 
@@ -255,7 +264,7 @@ def _lines_of_sight(
     which nothing is left are dropped, so that *n* may be 0.
     """
     starts, ends = [np.empty((0, 3))], [np.empty((0, 3))]
-    max_per_keyframe = max(1, _MAX_RAYS // len(T_grid_camera))
+    max_per_keyframe = max(1, max_lines // len(T_grid_camera))
     # 1. Take the lines from each keyframe to those of its features that lie in front of the camera, not
     # farther than `_MAX_RAY_M` along any axis; thin them evenly to the share of a keyframe.
     for keyframe, T in zip(version.keyframes, T_grid_camera, strict=True):
@@ -350,4 +359,4 @@ class _Raster:
             line = np.repeat(np.arange(len(samples)), samples)
             sample = np.arange(len(line)) - np.repeat(np.cumsum(samples) - samples, samples)
             share = sample / np.maximum(samples[line] - 1, 1)
-            self.mark_free(np.unique(self.cell_numbers(origin[line] + share[:, None] * direction[line])))
+            self.mark_free(self.cell_numbers(origin[line] + share[:, None] * direction[line]))
