@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from client_sdk.tracking.tracker import Tracker
     from client_sdk.trajectory import Trajectory
     from client_sdk.transfer.data_client import DataClient, DataOptions
+    from client_sdk.wheel_odometry import OdometryReading
 
 __all__ = [
     "Answer",
@@ -49,6 +50,7 @@ __all__ = [
     "Mapper",
     "MarkerScale",
     "MonocularOptions",
+    "OdometryReading",
     "OdometryScale",
     "OtherRobot",
     "PointMap",
@@ -88,6 +90,7 @@ _HOMES = {
     "Mapper": "mapper",
     "MarkerScale": "monocular.scale",
     "MonocularOptions": "frontend",
+    "OdometryReading": "wheel_odometry",
     "OdometryScale": "monocular.scale",
     "OtherRobot": "live",
     "PointMap": "point_map",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from client_sdk.auto_close import AutoClose
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from client_sdk.mapper import Mapper
     from client_sdk.point_map import PointMap
     from client_sdk.trajectory import Trajectory
+    from client_sdk.wheel_odometry import OdometryReading
     from rse_pf.geometry import Array
 
 __all__ = ["BlockingMapper", "BlockingRobot", "connect_blocking"]
@@ -179,9 +180,11 @@ class BlockingMapper:
         self.mapper = mapper
         self._wait = wait
 
-    def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
+    def track(
+        self, frame: Frame, *, position_m: Array | None = None, odometry: Sequence[OdometryReading] = ()
+    ) -> TrackedFrame:
         """Return the pose of the next frame; see `Mapper.track`."""
-        tracked: TrackedFrame = self._wait(self.mapper.track(frame, position_m=position_m))
+        tracked: TrackedFrame = self._wait(self.mapper.track(frame, position_m=position_m, odometry=odometry))
         return tracked
 
     @property

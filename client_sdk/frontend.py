@@ -376,8 +376,10 @@ class TrackedFrame:
         matches: Number of matches with landmarks; without a pose, the largest number of an attempt (0 without
             depth).
         status: ``lost`` without a pose, ``starting`` without a pose before a camera without depth has moved
-            enough, ``first`` with the first pose, ``tracked`` with another one.  These are the values that
-            `Mapper.track` returns; a `Tracker` itself reports ``tracked`` in place of ``lost`` and ``first``.
+            enough, ``first`` with the first pose, ``tracked`` with another one, ``odometry`` if the wheels
+            have carried the last pose to this frame, which the camera did not give.  These are the values
+            that `Mapper.track` returns; a `Tracker` itself reports ``tracked`` in place of ``lost`` and
+            ``first``.
         reason: Why there is no pose, why the pose is weak, or that its segment is not joined to the first
             one; empty otherwise.
         scale: Whether lengths are metres, or of an arbitrary unit.
@@ -397,6 +399,11 @@ class TrackedFrame:
         segment: Number of the present segment, that is, of the odometry frame.
         features: Features where the image shows them, whose rolling shutter is not undone; None where none
             were extracted.  Their points are NaN where depth is not used.
+        T_world_base: ``(4, 4)``, metres, pose of the robot's base; None without a pose, without a mount
+            (*T_base_camera* of the mapper), and up to scale.
+        pose_covariance: ``(6, 6)`` covariance of *T_world_base*: of its position (m) and its rotation (rad)
+            about the axes of the world, with the drift since the start or the last join; None without
+            *T_world_base*.
     """
 
     frame: Frame
@@ -404,7 +411,7 @@ class TrackedFrame:
     keyframe: bool
     inliers: int
     matches: int
-    status: Literal["first", "tracked", "lost", "starting"] = "tracked"
+    status: Literal["first", "tracked", "lost", "starting", "odometry"] = "tracked"
     reason: str = ""
     scale: Literal["metric", "up to scale"] = "metric"
     covariance: Array | None = None
@@ -415,6 +422,15 @@ class TrackedFrame:
     T_map_camera: Array | None = None
     segment: int = 0
     features: Features | None = None
+    T_world_base: Array | None = None
+    pose_covariance: Array | None = None
+
+    @property
+    def pose_source(self) -> Literal["visual", "odometry", "lost"]:
+        """What the pose is from: the image, or the wheels since the last pose of an image; ``lost``: none."""
+        if self.T_world_camera is None:
+            return "lost"
+        return "odometry" if self.status == "odometry" else "visual"
 
     @property
     def T_world_body(self) -> Array | None:

@@ -26,7 +26,7 @@ import asyncio
 import functools
 import json
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -53,8 +53,9 @@ from client_sdk.tracking.segments import (
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory, write_trajectory
+from client_sdk.wheel_odometry import BaseCovariance, OdometryReading, WheelOdometry
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, orthonormalise
 from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
 from rse_pf.slam.inertial import KeyframeImu, upright_rotation
@@ -131,6 +132,7 @@ class Mapper:
         scale: OdometryScale | MarkerScale | None = None,
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
+        T_base_camera: Array | None = None,
         keyframes_of: str = "",
         adds_frames: bool = True,
         recorder: RobotRecorder | None = None,
@@ -154,7 +156,10 @@ class Mapper:
             map_options: Density of the map of frames with depth.
             T_world_start: ``(4, 4)`` pose of the first frame in the world; with it the world is not turned
                 when gravity becomes known.  None: the identity; with an IMU a pose whose world has z up, in
-                which a level camera looks along x.
+                which a level camera looks along x; else, with *T_base_camera*, that.
+            T_base_camera: ``(4, 4)`` mount of the camera on the robot's base, metres; x of the base is ahead,
+                z up.  With it the world is the frame of the base at the first image, unless *T_world_start*
+                or an IMU gives another one, and `track` takes wheel odometry.
             keyframes_of: Name of the robot whose keyframes are kept for `encoded_map`, about 50 kB each.
                 Empty: none is kept.
             adds_frames: Whether each frame with depth is added to the map.  With False the caller adds
@@ -168,7 +173,8 @@ class Mapper:
             optimiser: Function for the bundle adjustment of a camera without depth; None: the built-in one.
 
         Raises:
-            UsageError: An argument that must be a function is none, or *features* has no name.
+            UsageError: An argument that must be a function is none, *features* has no name, or
+                *T_base_camera* is no pose.
         """
         self.camera = camera
         """Intrinsics of all frames: the argument *camera*, else those of the first frame, and None before."""
@@ -193,7 +199,10 @@ class Mapper:
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
         self._recorder = recorder
-        self._plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
+        self._wheels = None if T_base_camera is None else WheelOdometry(T_base_camera)
+        self._base_covariance = BaseCovariance()
+        plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
+        self._plugins = replace(plugins, wheels=self._wheels)
         self._processed_joins = 0  # joins that were applied; with a monocular tracker, plus its loop closures
         self._depth_source: Literal["depth", "stereo"] = "depth"
         self._metric_segments: set[int] = set()  # segments of a monocular tracker whose scale is known
@@ -203,7 +212,9 @@ class Mapper:
         self._lost_reasons: Counter[str] = Counter()
         self._start_reason = ""
 
-    async def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
+    async def track(
+        self, frame: Frame, *, position_m: Array | None = None, odometry: Sequence[OdometryReading] = ()
+    ) -> TrackedFrame:
         """Return the pose of the next frame, or the reason why it has none.
 
         Images are processed in a thread.  A call waits until the call for the frame before has returned.
@@ -211,16 +222,22 @@ class Mapper:
         Args:
             frame: Next frame of the same camera, in the order of time.
             position_m: ``(3,)`` position of the camera by the robot's odometry, metres, for `OdometryScale`.
+            odometry: Readings of the wheels since the last call, in the order of time, in any fixed frame.
+                The motion to the time of the frame is interpolated, and extrapolated by at most 0.1 s.
 
         Raises:
             UsageError: The frame is of another camera, not later than the one before, or the median of its
-                depths is impossible in metres; such a frame changes nothing.  Or a function of the user, such
-                as *features*, failed.
+                depths is impossible in metres; or there is *odometry* without *T_base_camera*, or that goes
+                back in time: such a call changes nothing.  Or a function of the user, such as *features*,
+                failed.
             ConfigurationError: The function that answers pose queries cannot work, such as without a package.
         """
         async with self._frame_lock:
             # 1. Refuse a frame of another camera, of an earlier time, or with impossible depths.
+            self._check_odometry(odometry)
             self._check(frame)
+            if self._wheels is not None:
+                self._wheels.add(odometry)
             if self._recorder is not None:
                 self._recorder.record_frame(frame.timestamp_s, frame.rgb)
             # 2. Choose the tracker with the first frame, and add the frame's IMU samples.
@@ -255,6 +272,11 @@ class Mapper:
             return await asyncio.to_thread(self._finish, step, answer, failure, position_m)
 
     @property
+    def odometry_trouble(self) -> str:
+        """Why the wheel odometry is not used, as one sentence; empty if it is used, or there is none."""
+        return "" if self._wheels is None else self._wheels.trouble
+
+    @property
     def map(self) -> PointMap:
         """Points so far of segment 0 and of all segments that were joined to it.
 
@@ -283,10 +305,15 @@ class Mapper:
     def restart_clock(self) -> None:
         """Accept a next frame with an earlier time stamp, such as after a bag was started again."""
         self._last_stamp_s = float("-inf")
+        if self._wheels is not None:
+            self._wheels.clear()
 
     @property
     def lost_frames(self) -> int:
-        """Number of frames without a pose; frames before the start of a camera without depth do not count."""
+        """Number of frames without a pose by the camera, also those whose pose the wheels have carried.
+
+        Frames before the start of a camera without depth do not count.
+        """
         return 0 if self._tracker is None else self._tracker.lost_frames
 
     @property
@@ -566,6 +593,16 @@ class Mapper:
 
     # --- Check of each frame, and choice of the tracker by the first one ---
 
+    def _check_odometry(self, readings: Sequence[OdometryReading]) -> None:
+        """Refuse readings without a mount, and readings that go back in time; raises UsageError."""
+        if self._wheels is not None:
+            self._wheels.check(readings)
+        elif len(readings):
+            raise UsageError(
+                "odometry of the wheels does not tell how the camera moves without its mount",
+                hint="make the mapper with T_base_camera, the (4, 4) pose of the camera on the base",
+            )
+
     def _check(self, frame: Frame) -> None:
         """Note camera and time of a frame that can be tracked.
 
@@ -604,6 +641,8 @@ class Mapper:
         if self._tracker is None:
             if frame.imu is not None:
                 self._start_imu(frame.imu, frame.camera)
+            elif self._T_world_start is None and self._wheels is not None:
+                self._T_world_start, self._is_upright = self._wheels.T_base_camera, True
             has_depth = bool(frame.depth_m.any()) if self._uses_depth is None else self._uses_depth
             if frame.stereo is not None or has_depth:
                 self._depth_source = "depth" if frame.stereo is None else "stereo"
@@ -630,6 +669,38 @@ class Mapper:
         self, tracked: TrackedFrame, answer: PoseAnswer | None, failure: str, position_m: Array | None
     ) -> TrackedFrame:
         """Complete the result of a frame, and add the frame to trajectory and map.
+
+        A pose that the wheels carry is added afterwards: neither trajectory nor map contain it.
+        """
+        tracked = self._finish_visual(tracked, answer, failure, position_m)
+        if self._wheels is None or tracked.status == "starting" or tracked.scale != "metric":
+            return tracked
+        return self._add_base(self._wheels, tracked)
+
+    def _add_base(self, wheels: WheelOdometry, tracked: TrackedFrame) -> TrackedFrame:
+        """Return the result of a frame with the pose of the base, carried by the wheels if it has none."""
+        pose, last = tracked.T_world_camera, None if self._tracker is None else self._tracker.last_pose
+        if pose is not None:
+            T_world_base = wheels.base_pose(pose)
+            covariance = self._base_covariance.add_visual(T_world_base, pose, tracked.covariance)
+            return replace(tracked, T_world_base=T_world_base, pose_covariance=covariance)
+        motion = None if last is None else wheels.motion(last[0], tracked.frame.timestamp_s)
+        if last is None or motion is None:
+            return tracked
+        pose = orthonormalise(last[1] @ wheels.camera_motion(motion))
+        T_world_base = wheels.base_pose(pose)
+        return replace(
+            tracked,
+            T_world_camera=pose,
+            status="odometry",
+            T_world_base=T_world_base,
+            pose_covariance=self._base_covariance.carried(T_world_base, motion),
+        )
+
+    def _finish_visual(
+        self, tracked: TrackedFrame, answer: PoseAnswer | None, failure: str, position_m: Array | None
+    ) -> TrackedFrame:
+        """Complete the result of a frame by its image, and add the frame to trajectory and map.
 
         *failure* is why the last pose query was not answered, empty if it was.
         """

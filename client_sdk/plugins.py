@@ -33,6 +33,7 @@ import numpy.typing as npt
 
 from client_sdk.imu.estimator import ImuEstimator
 from client_sdk.monocular.bundle import Bundle
+from client_sdk.wheel_odometry import WheelOdometry
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import MAX_DESCRIPTOR_SIZE, ORB, DescriptorKind, Descriptors
@@ -397,7 +398,7 @@ def _has_shape(array: Array, shape: tuple[int, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plugins:
-    """The parts of a tracker that a user replaces, and the IMU whose rotations the tracker uses.
+    """The parts of a tracker that a user replaces, and the IMU and the wheels whose motions the tracker uses.
 
     Attributes:
         features: Feature extractor; None for ORB.
@@ -405,6 +406,7 @@ class Plugins:
         loops: Place recogniser; None for the VLAD vector of the descriptors.
         optimiser: Bundle adjustment of a camera without depth; None for the built-in one.
         inertial: The IMU of the camera, which the mapper sets with the first samples; None without one.
+        wheels: The wheel odometry of the robot; None without one.
     """
 
     features: FeaturesPlugin | None = None
@@ -412,6 +414,7 @@ class Plugins:
     loops: LoopsPlugin | None = None
     optimiser: OptimiserPlugin | None = None
     inertial: ImuEstimator | None = None
+    wheels: WheelOdometry | None = None
 
     @classmethod
     def wrap(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from types import TracebackType
 from typing import Any
 
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live.alignments import Correction
 from client_sdk.live.live_mapper import LiveMapper
+from client_sdk.wheel_odometry import OdometryReading
 
 __all__ = ["BlockingLiveMapper"]
 
@@ -37,9 +38,9 @@ class BlockingLiveMapper:
         """Send the queued keyframes and attachments, and leave the map; see `LiveMapper.__aexit__`."""
         self._wait(self.mapper.__aexit__(kind, error, trace))
 
-    def track(self, frame: Frame) -> TrackedFrame:
+    def track(self, frame: Frame, *, odometry: Sequence[OdometryReading] = ()) -> TrackedFrame:
         """Return the pose of the next frame; see `LiveMapper.track`."""
-        tracked: TrackedFrame = self._wait(self.mapper.track(frame))
+        tracked: TrackedFrame = self._wait(self.mapper.track(frame, odometry=odometry))
         return tracked
 
     def corrections(self) -> Iterator[Correction]:

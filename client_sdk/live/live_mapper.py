@@ -24,7 +24,7 @@ import asyncio
 import contextlib
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -49,6 +49,7 @@ from client_sdk.tracking.monocular_segment import AdjustedKeyframe
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.segments import add_to_cloud
 from client_sdk.trajectory import Trajectory
+from client_sdk.wheel_odometry import OdometryReading
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
 from rse_pf.wire.live_map import live_topic
@@ -90,6 +91,7 @@ class LiveMapper:
         live: LiveOptions | None = None,
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
+        T_base_camera: Array | None = None,
         features: FeaturesFunction | None = None,
         motion: MotionFunction | None = None,
         loops: LoopsFunction | None = None,
@@ -115,7 +117,10 @@ class LiveMapper:
                 defaults.
             T_world_start: ``(4, 4)`` pose of the camera at the first frame in the odometry frame (which the
                 tracker calls world).  None means the identity; with an IMU it means a pose in an odometry
-                frame whose z axis points up, in which a level camera looks along x.
+                frame whose z axis points up, in which a level camera looks along x; else, with
+                *T_base_camera*, that.
+            T_base_camera: ``(4, 4)`` mount of the camera on the robot's base, metres, see `Mapper`; with it
+                `track` takes wheel odometry.
             features: Function that finds the features of an image; None means ORB.  All robots of a map must
                 use the same.
             motion: Function that predicts the pose of the next frame; None means constant velocity.
@@ -160,6 +165,7 @@ class LiveMapper:
             options=replace(options or FrontEndOptions.live(), segment_after=_NEVER),
             map_options=map_options,
             T_world_start=T_world_start,
+            T_base_camera=T_base_camera,
             adds_frames=False,
             holds_world=True,
             features=features,
@@ -248,15 +254,17 @@ class LiveMapper:
             self._queue.close()
             self._correction_stream.close()
 
-    async def track(self, frame: Frame) -> TrackedFrame:
+    async def track(self, frame: Frame, *, odometry: Sequence[OdometryReading] = ()) -> TrackedFrame:
         """Return the pose of the next frame in the odometry frame and in the map, or why there is none.
 
         Args:
             frame: Next frame of the same camera, in the order of time.
+            odometry: Readings of the wheels since the last call, see `Mapper.track`.
 
         Raises:
             UsageError: The map is not joined, the frame is of another camera, the first frame has no depth
-                although *depth* is True, or a keyframe cannot be written to the spool folder.
+                although *depth* is True, *odometry* is refused as by `Mapper.track`, or a keyframe cannot be
+                written to the spool folder.
         """
         if not self._is_joined:
             raise UsageError(
@@ -275,14 +283,14 @@ class LiveMapper:
                 self._mapper.restart(self._poses[-1][2])
                 self._begin_segment()
             # 3. Track the frame.
-            tracked = await self._mapper.track(frame)
+            tracked = await self._mapper.track(frame, odometry=odometry)
             # 4. Without depth, queue the settled keyframes of the tracker.
             tracker = self._mapper.monocular_tracker
-            if tracker is not None and tracked.T_world_camera is not None:
+            if tracker is not None and tracked.T_world_camera is not None:  # also if it is carried
                 tracked = await self._follow_monocular(tracker, tracked, tracked.T_world_camera)
             # 5. With depth, make a keyframe of the frame if it moved far enough from the last keyframe.
             pose = tracked.T_world_camera
-            if pose is not None:
+            if pose is not None and tracked.pose_source == "visual":
                 self._poses.append((frame.timestamp_s, self._segment, pose))
                 features = self._mapper.features
                 if features is not None and self._is_keyframe(pose):
@@ -394,6 +402,11 @@ class LiveMapper:
         """
         relocalisation_trouble = "" if self.aligned else self._relocaliser.trouble
         return self._sender.trouble or self._update_trouble or relocalisation_trouble
+
+    @property
+    def odometry_trouble(self) -> str:
+        """Why the wheel odometry is not used, see `Mapper.odometry_trouble`."""
+        return self._mapper.odometry_trouble
 
     @property
     def keyframes_waiting(self) -> int:

@@ -289,6 +289,13 @@ class MonocularSegment:
             view=view, T_camera_world=T_camera_world, landmarks=landmarks, matches=count, is_weak=False
         )
 
+    @property
+    def last_pose(self) -> tuple[float, Array]:
+        """Time in seconds and ``T_camera_world`` ``(4, 4)`` of the newest frame, in the segment's unit."""
+        newest = max(self.frames, key=lambda frame: frame.timestamp_s)
+        keyframe = self.map.keyframes[newest.keyframe]
+        return newest.timestamp_s, inverse(newest.T_keyframe_camera) @ keyframe.T_camera_world
+
     def trajectory(self) -> Trajectory:
         """Return ``T_world_camera`` of all frames in the order of time, in the segment's frame and unit."""
         stamps_s = np.array([frame.timestamp_s for frame in self.frames])

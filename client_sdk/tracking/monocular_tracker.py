@@ -215,6 +215,17 @@ class MonocularTracker:
         return self._state.segment
 
     @property
+    def last_pose(self) -> tuple[float, Array] | None:
+        """Time in seconds and ``T_world_camera`` ``(4, 4)`` of the last pose; None before the first.
+
+        The pose is in the present segment, with its corrections and in its unit.
+        """
+        if not self._segments:
+            return None
+        timestamp_s, T_camera_world = self._present.last_pose
+        return timestamp_s, self._T_world_start @ inverse(T_camera_world)
+
+    @property
     def segments(self) -> tuple[int, ...]:
         """The numbers of all segments that were not joined to others, ascending; the first is 0."""
         return tuple(sorted(self._segments))

@@ -233,6 +233,14 @@ class Tracker:
         return max(0, self._state.segment)
 
     @property
+    def last_pose(self) -> tuple[float, Array] | None:
+        """Time in seconds and ``T_world_camera`` ``(4, 4)`` of the last accepted pose; None before the first.
+
+        The pose is in the present segment, with its corrections.
+        """
+        return (self._state.timestamp_s, self._state.T_world_camera) if self._segments else None
+
+    @property
     def unrecognised(self) -> int:
         """Number of frames since the last pose that show enough features with depth and no known place.
 
