@@ -92,10 +92,13 @@ class FairThreads:
         return result
 
     def close(self) -> None:
-        """Drop the waiting work, whose calls of `run` then never return, and wait for the running work."""
+        """Drop the waiting work, whose calls of `run` are cancelled, and wait for the running work."""
         with self._lock:
             self._free = 0
-            self._queue.remove(lambda task: True)
+            dropped = self._queue.remove(lambda task: True)
+        for task in dropped:
+            with contextlib.suppress(RuntimeError):  # the event loop was closed: no call of `run` waits
+                task.loop.call_soon_threadsafe(task.future.cancel)
         for _ in self._threads:
             self._started.put(None)
         for thread in self._threads:

@@ -102,3 +102,18 @@ async def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads)
     assert not gate.entered.acquire(blocking=False), "of eight, six for the tenant, one for the other"
     gate.open.set()
     assert await asyncio.wait_for(asyncio.gather(*flood, *one), TIMEOUT_S) == ["done"] * 104
+
+
+async def test_a_call_that_waits_is_cancelled_when_the_threads_are_closed() -> None:
+    gate, threads = Gate(), FairThreads(1)
+
+    runs = asyncio.ensure_future(threads.run(ROBOT, gate.work))
+    waits = asyncio.ensure_future(threads.run(OTHER, int, "1"))
+    await gate.wait_entered()
+    closing = asyncio.ensure_future(asyncio.to_thread(threads.close))
+
+    with pytest.raises(asyncio.CancelledError):
+        await asyncio.wait_for(waits, TIMEOUT_S)
+    gate.open.set()
+    assert await asyncio.wait_for(runs, TIMEOUT_S) == "done"
+    await closing

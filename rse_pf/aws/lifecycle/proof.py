@@ -77,7 +77,9 @@ def prove(
     """
     tagged = _list_tagged(account, names)
     kept_names = sorted({(_kind_if_kept(arn), _name(arn)) for arn in tagged if _kind_if_kept(arn)})
-    remaining = {arn for arn in tagged if not _kind_if_kept(arn)} - _find_ended_servers(account, tagged)
+    remaining = {arn for arn in tagged if not _kind_if_kept(arn)} - _find_ended_servers(
+        account, names, tagged
+    )
     remaining |= {
         f"{leftover.kind} {leftover.name}"
         for leftover in find_leftovers(account, names)
@@ -108,14 +110,14 @@ def _name(arn: str) -> str:
     return arn.split(":", 5)[5].removeprefix("secret:")
 
 
-def _find_ended_servers(account: Account, tagged: set[str]) -> set[str]:
+def _find_ended_servers(account: Account, names: ResourceNames, tagged: set[str]) -> set[str]:
     """Return the ARNs of those *tagged* instances that are terminated; AWS lists them for another hour."""
     instances = {arn.rpartition("/")[2]: arn for arn in tagged if ":instance/i-" in arn}
     if not instances:
         return set()
     rows = account.pages(
         "ec2", "describe_instances", "Reservations",
-        Filters=[{"Name": "instance-id", "Values": sorted(instances)[:200]}],
+        Filters=[{"Name": f"tag:{DEPLOYMENT_TAG}", "Values": [names.prefix]}],
     )  # fmt: skip
     alive = {
         instance["InstanceId"]
