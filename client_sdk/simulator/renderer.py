@@ -66,6 +66,7 @@ class Renderer:
         ).astype(np.float32)
         self._inverse_ray_lengths = 1.0 / np.sqrt((self._rays_camera**2).sum(axis=0)).ravel()
         self._level_starts, self._texels, self._last_levels = _make_mip_maps(world)
+        self._corners = np.array([_corners(face) for face in faces])
         self._axis = np.array([face.axis for face in faces], dtype=np.int8)
         self._texture = np.array([face.texture for face in faces], dtype=np.int32)
         self._texel_m = np.array([face.texel_m for face in faces], dtype=np.float32)
@@ -130,9 +131,10 @@ class Renderer:
         face_numbers = np.full(rays.shape[1:], -1, dtype=np.int32)
         with np.errstate(divide="ignore"):
             inverse_rays = (1.0 / rays).astype(np.float32)
-        for number, face in enumerate(self._faces):
+        for number in self._faces_in_view(T_world_camera):
+            face = self._faces[number]
             distance_in_front = (float(origin[face.axis]) - face.offset) * face.sign
-            box = self._bounding_box(face, T_world_camera) if distance_in_front > 0 else None
+            box = self._bounding_box(number, T_world_camera) if distance_in_front > 0 else None
             if box is None:
                 continue
             u_axis, v_axis = (axis for axis in range(3) if axis != face.axis)
@@ -147,17 +149,23 @@ class Renderer:
             face_numbers[box][is_visible] = number
         return depth_m, face_numbers
 
-    def _bounding_box(self, face: Face, T_world_camera: Array) -> tuple[slice, slice] | None:
+    def _faces_in_view(self, T_world_camera: Array) -> list[int]:
+        """Return the numbers of all faces but those that lie wholly beyond one side of the field of view."""
+        corners = (self._corners - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        low, high = self._rays_camera[:2, 0, 0], self._rays_camera[:2, -1, -1]
+        depths = corners[..., 2:]
+        is_beyond: npt.NDArray[np.bool_] = np.concatenate(
+            (corners[..., :2] < low * depths, corners[..., :2] > high * depths, depths < _NEAR_M), axis=-1
+        )
+        in_view: list[int] = np.flatnonzero(~is_beyond.all(axis=1).any(axis=1)).tolist()
+        return in_view
+
+    def _bounding_box(self, number: int, T_world_camera: Array) -> tuple[slice, slice] | None:
         """Return rows and columns of a face's bounding box in the image; None if the face is not in view.
 
         The box is that of the part of the face that is farther than the near plane.
         """
-        u_axis, v_axis = (axis for axis in range(3) if axis != face.axis)
-        corners = np.empty((4, 3))
-        corners[:, face.axis] = face.offset
-        corners[:, u_axis] = [face.low[0], face.high[0], face.high[0], face.low[0]]
-        corners[:, v_axis] = [face.low[1], face.low[1], face.high[1], face.high[1]]
-        corners_camera = (corners - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        corners_camera = (self._corners[number] - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         # Edges that cross the near plane contribute their intersection with it.
         next_corners = np.roll(corners_camera, -1, axis=0)
         is_crossing = (corners_camera[:, 2] < _NEAR_M) != (next_corners[:, 2] < _NEAR_M)
@@ -225,6 +233,16 @@ class Renderer:
         corner = 1.0 - _CORNER_SHADE / (1.0 + _CORNER_FALLOFF * edge_distance * edge_distance)
         brightness: _Image = lamp * corner * ((1.0 - _FACING_LIGHT) + _FACING_LIGHT * cosine)
         return brightness
+
+
+def _corners(face: Face) -> Array:
+    """Return the corners ``(4, 3)`` of a face in the world, one after the other along its border."""
+    u_axis, v_axis = (axis for axis in range(3) if axis != face.axis)
+    corners = np.empty((4, 3))
+    corners[:, face.axis] = face.offset
+    corners[:, u_axis] = [face.low[0], face.high[0], face.high[0], face.low[0]]
+    corners[:, v_axis] = [face.low[1], face.low[1], face.high[1], face.high[1]]
+    return corners
 
 
 def add_depth_noise(depth_m: _Image, cosine: _Image, rng: np.random.Generator) -> _Image:
