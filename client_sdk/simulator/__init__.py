@@ -3,6 +3,9 @@
 1. `world` makes the rooms and their furniture as textured rectangles.
 2. `renderer` draws images and exact depths, and adds the noise of the sensors.
 3. `drive` makes the trajectories of robots through the rooms, and yields the rendered frames.
+4. `building` makes larger buildings, and `base` drives a robot on wheels through them, with its odometry.
+
+The textures of both are made by `textures`.
 """
 
 from client_sdk.simulator.drive import (
