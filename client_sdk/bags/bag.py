@@ -96,15 +96,16 @@ class BagOptions:
         imu: Topic of the IMU.
         lens: Lens of the colour camera that replaces the one in the bag.
         rig: Rig of one camera or of a stereo pair, and the IMU, that replaces those in the bag.
-        depth_scale: Units of depth per metre.  None uses the unit that the bag states, else 1000 for 16-bit
-            depth and 1 for floats.
+        depth_scale: Units of depth per metre.  None uses the unit that the bag states, or otherwise 1000 for
+            16-bit depth and 1 for floats.
         pair_within_s: Largest difference of the time stamps, seconds, of the colour and the depth image of a
             frame, or of its left and right image.
-        use_depth: False uses neither depth nor a stereo pair, unless *right* or *use_stereo* asks for a pair.
-        use_stereo: True uses a stereo pair even if there is depth; False uses only the left camera of a pair;
-            None uses a pair if there is no depth.
-        use_imu: None uses the IMU if it can be used; True refuses a bag without a usable IMU; False uses
-            none.
+        use_depth: False uses neither depth images nor a stereo pair, unless *right* or *use_stereo* asks for
+            a pair.
+        use_stereo: True uses a stereo pair even if the bag has depth images; False uses only the left camera
+            of a pair; None uses a pair if the bag has no depth images.
+        use_imu: True uses the IMU, and refuses a bag without a usable IMU; False leaves the IMU out; None
+            uses a usable IMU.
 
     Raises:
         UsageError: *depth_scale* or *pair_within_s* is not above 0.
@@ -132,7 +133,7 @@ class BagOptions:
 
 @dataclass(slots=True, eq=False)
 class Bag(AutoClose):
-    """The frames of an open bag: iterate over it, or `read` single frames; close it, or use it in ``with``.
+    """The frames of an open bag, for iteration or to `read` single frames; a context manager that closes it.
 
     Frames of the iteration have the samples of ``imu`` since the frame before; those of `read` have none.
 
@@ -141,7 +142,7 @@ class Bag(AutoClose):
         camera: Pinhole camera of all frames; the rectified left one for a stereo pair.
         timestamps_s: Ascending time stamps of the frames, s.
         has_depth: Whether frames have depth.
-        truth: Trajectory of the camera with which an estimate can be compared; None if there is none.
+        truth: Trajectory of the camera with which an estimate can be compared; None if the bag has none.
         truth_kind: ``ground truth``, ``reference`` for poses that another program estimated, or ``none``.
         notes: Sentences for the user on the topics that are used, and on what was assumed.
         chosen: The topics that are used.
@@ -237,7 +238,7 @@ class Bag(AutoClose):
 def open_bag(path: Path | str, options: BagOptions | None = None) -> Bag:
     """Open a ROS 1 bag, or a ROS 2 bag in sqlite3 or MCAP; images are read later.
 
-    The bag is read once for its time stamps, which takes a while for a large one.
+    The bag is read once for its time stamps, which takes a while for a large bag.
 
     Raises:
         UsageError: The bag cannot be read, a topic or calibration is missing or cannot be used, or facts
@@ -335,8 +336,8 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
 
 
 _Pair = tuple[tuple[str, int, int], ...]
-"""The images of a frame, one or two: for each its topic, the stamp of the message, and the time of writing,
-both in nanoseconds."""
+"""The one or two images of a frame.  Of each image: its topic, the stamp of the message, and the time of
+writing, both in nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -350,7 +351,7 @@ class _TopicRectifier:
     rectifiers: Sequence[ImageMap]
 
     def of(self, image: tuple[str, int, int]) -> ImageMap:
-        """Return the map that undistorts an image, given as topic, stamp and time of writing."""
+        """Return the pixel map that undistorts an image: its topic, stamp (ns) and time of writing (ns)."""
         _, stamp_ns, log_ns = image
         return self.rectifiers[self.times.row_at(stamp_ns, log_ns) if len(self.rectifiers) > 1 else 0]
 
@@ -422,7 +423,7 @@ def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None
 def _unit_note(
     unit_m: float | None, options: BagOptions, depth_scale: float, depth: Topic | None
 ) -> tuple[str, ...]:
-    """Return a sentence on the unit of depth, if the bag states one or if one is assumed; else nothing.
+    """Return a sentence on the unit of depth if the bag states a unit or if a unit is assumed, else no text.
 
     *unit_m* is the stated unit in metres, or None.  *depth* is the topic of 16-bit depth; None for floats,
     which are metres by REP 118.
@@ -498,7 +499,7 @@ def _lenses_of_colour(
 
 
 def _usual_lens(lenses: Sequence[Lens], times: CameraTimes, images: ImageStamps) -> Lens:
-    """Return the lens that is valid for most images."""
+    """Return that of the *lenses* of a drive which is valid for most images."""
     rows = [times.row_at(int(s), int(log)) for s, log in zip(images.header_ns, images.log_ns, strict=True)]
     return lenses[Counter(rows).most_common(1)[0][0]] if rows and len(lenses) > 1 else lenses[0]
 
@@ -681,7 +682,7 @@ def _prepare_depth(
 
 
 def _is_other_view(one: Camera, other: Camera) -> bool:
-    """Return whether two cameras have different fields of view: intrinsics relative to the image's size."""
+    """Return whether two cameras have different fields of view, by intrinsics over the image's size."""
 
     def shares_of(camera: Camera) -> Array:
         across, down = camera.width, camera.height
@@ -753,7 +754,9 @@ def _imu(
     frame, imu_frame = formats[chosen.colour.name].frame, index.imu.frame
     try:
         if index.colour.clock_step_ns:
-            raise UsageError("the clock of its stamps was set back in the drive", hint="cut the bag there")
+            raise UsageError(
+                "the clock of the IMU's stamps was set back in the drive", hint="cut the bag at that time"
+            )
         track, note = imu_track(
             index.imu,
             chosen.imu.name,

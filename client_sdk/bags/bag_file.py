@@ -25,6 +25,7 @@ _FAULTS = (
     RuntimeError, TypeError, ValueError, struct.error,
 )  # fmt: skip
 """Exceptions that the readers raise for malformed bags, in addition to their own ones."""
+# Action for a bag that cannot be read.
 _REPAIR = "repair it: rosbag reindex (ROS 1), ros2 bag reindex, or mcap recover; or copy it again"
 
 
@@ -52,7 +53,7 @@ class RawMessage:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a ROS bag by its ending or ``metadata.yaml``, or a folder of one bag file."""
+    """Return whether a path is a ROS bag: a bag file, or a folder of one or with ``metadata.yaml``."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or _only_bag_of(path) is not None
     return path.suffix in _ENDINGS
@@ -88,7 +89,7 @@ def open_bag_file(path: Path) -> BagFile:
 
 
 class BagFile(AutoClose):
-    """An open bag, whose topics are in ``topics``; close it, or use it in ``with``."""
+    """An open bag, whose topics are in ``topics``; a context manager that closes the bag."""
 
     def __init__(self, path: Path, reader: Any, store: Any, *, size_bytes: int, is_ros1: bool) -> None:
         self.path = path
@@ -109,7 +110,7 @@ class BagFile(AutoClose):
         """Yield the messages of the topics *names* in the order of the bag.
 
         *start_ns* is the time of writing, nanoseconds, of the first message; None begins at the start.  Only
-        one of these iterators may be in use at a time.
+        one such iterator of a bag may be in use at a time.
 
         Raises:
             BrokenMessage: The bag is damaged, and cannot be read further.
@@ -155,7 +156,7 @@ class BagFile(AutoClose):
         try:
             if self._is_ros1:
                 return self._store.deserialize_ros1(raw.data, raw.kind)
-            # Pass a view: of bytes, the library would copy all that follow the four bytes of the head.
+            # Pass a view: given bytes, the library would copy everything after the four bytes of the head.
             return self._store.deserialize_cdr(memoryview(raw.data), raw.kind)
         except _all_faults() as error:
             raise BrokenMessage(_said(error)) from error
@@ -166,7 +167,7 @@ class BagFile(AutoClose):
 
 
 def _only_bag_of(folder: Path) -> Path | None:
-    """Return the only file in a folder with the ending of a bag; None if there is none, or several."""
+    """Return the only file in a folder with the ending of a bag; None for no such file, or several."""
     bag_paths = [path for path in folder.iterdir() if path.suffix in _ENDINGS and path.is_file()]
     return bag_paths[0] if len(bag_paths) == 1 else None
 

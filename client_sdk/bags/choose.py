@@ -96,15 +96,17 @@ def choose_topics(
         topics: All topics of the bag.
         formats: Format of the first message of each image topic, by name of the topic.
         info_frames: Frame of each ``CameraInfo`` topic, by name of the topic.
-        colour: Topic of the colour or left images that the user named; None chooses one, also below.
+        colour: Topic of the colour or left images that the user named.  For this and the following topics,
+            None lets this function choose.
         depth: Topic of the depth images that the user named.
         right: Topic of the right images that the user named.
         info: Topic of the ``CameraInfo`` of *colour* that the user named.
         poses: Topic of the poses that the user named.
         imu: Topic of the IMU that the user named.
-        use_depth: False uses neither depth nor a stereo pair, unless *right* or *use_stereo* asks for a pair.
-        use_stereo: True uses a stereo pair even if there is depth; False uses only the left camera of a pair;
-            None uses a pair if there is no depth.
+        use_depth: False uses neither depth images nor a stereo pair, unless *right* or *use_stereo* asks for
+            a pair.
+        use_stereo: True uses a stereo pair even if the bag has depth images; False uses only the left camera
+            of a pair; None uses a pair if the bag has no depth images.
         use_imu: Whether to use an IMU.
 
     Raises:
@@ -212,9 +214,9 @@ def _choose_pair(
     left: str | None,
     right: str | None,
 ) -> tuple[Topic, Topic] | None:
-    """Return the left and right topic of the pair that the user names, or else of the only pair by names.
+    """Return the left and right topic of the pair that the user names, or of the only pair by topic names.
 
-    None if there is no such pair, or several.
+    The result is None if the bag has no such pair, or several.
     """
     pairs = _side_pairs(images, formats)
     if right is not None:
@@ -302,7 +304,7 @@ def _encodings(wanted: str) -> str:
 
 
 def _base(topic: Topic) -> str:
-    """Return the name of the raw topic that a compressed one belongs to."""
+    """Return the name of the raw image topic from which the name of a compressed image topic is derived."""
     return _base_of(topic.name) if topic.kind == COMPRESSED_IMAGE else topic.name
 
 
@@ -314,10 +316,10 @@ def _base_of(name: str) -> str:
 def _info_of(
     topic: Topic, infos: Sequence[Topic], formats: Mapping[str, ImageFormat], frames: Mapping[str, str]
 ) -> Topic | None:
-    """Return the ``CameraInfo`` topic of an image topic; None if there is none, or no unique one.
+    """Return the ``CameraInfo`` topic of an image topic; None if no topic, or no single one, fits.
 
-    That is the topic with the name that ROS prescribes, else the one that shares more of its name with this
-    image topic than with others, else the only one with the same frame.
+    The first of three rules that finds a topic decides: the name that ROS prescribes; a name that shares more
+    leading parts with this image topic than with others; the only ``CameraInfo`` with the same frame.
 
     A RealSense recorder writes ``Color_0/image/data`` and ``Color_0/info/camera_info``, all with one frame.
     """
@@ -351,7 +353,7 @@ def _poses(topics: Sequence[Topic], named: str | None) -> Topic | None:
 
 
 def _imu(topics: Sequence[Topic], named: str | None) -> Topic | None:
-    """Return the named IMU topic, else the one with most messages; None without one.
+    """Return the IMU topic *named* by the user, or else that with most messages; None without an IMU topic.
 
     Topics with ``gyro`` or ``accel`` in their name hold one of the two sensors only, and are not chosen.
     """

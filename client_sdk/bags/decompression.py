@@ -18,20 +18,21 @@ __all__ = ["MAX_CHUNK_BYTES", "Allowance", "bound_reader", "charge"]
 MAX_CHUNK_BYTES = 256 << 20
 """Largest decompressed size of a chunk or message; writers close a chunk after some MB and one message."""
 _FREE_BYTES = 4 << 30  # bytes that one pass over a bag may decompress, whatever the size of the bag
-_RATIO = 200  # bytes that one pass may decompress in addition for each byte of the bag
+# Bytes that one pass may decompress, beyond `_FREE_BYTES`, for each byte of the bag.
+_EXTRA_BYTES_PER_BAG_BYTE = 200
 
 
 class Allowance:
     """The number of bytes that one pass over a bag of *size_bytes* may still decompress, ``left_bytes``."""
 
     def __init__(self, size_bytes: int) -> None:
-        self.left_bytes = _FREE_BYTES + _RATIO * size_bytes
+        self.left_bytes = _FREE_BYTES + _EXTRA_BYTES_PER_BAG_BYTE * size_bytes
 
     def take(self, size_bytes: int) -> None:
         """Subtract decompressed bytes; raises ValueError if none are left."""
         self.left_bytes -= size_bytes
         if self.left_bytes < 0:
-            raise ValueError("it decompresses to far more than it has bytes")
+            raise ValueError("the bag decompresses to far more bytes than its file has")
 
 
 _charged = Allowance(0)  # the allowance from which decompressed bytes are subtracted at present

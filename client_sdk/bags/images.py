@@ -29,7 +29,8 @@ _COLOUR = {
     "yuv422": (2, "YUV2RGB_UYVY"), "uyvy": (2, "YUV2RGB_UYVY"),
     "yuv422_yuy2": (2, "YUV2RGB_YUY2"), "yuyv": (2, "YUV2RGB_YUY2"),
 }  # fmt: skip
-"""Encodings of colour images: bytes of a pixel, and OpenCV's conversion to RGB (None for RGB)."""
+"""Encodings of colour images, each with the bytes of a pixel and OpenCV's conversion to RGB (None for
+RGB)."""
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}  # encodings of depth images, and their numpy types
 
 _JPEG = b"\xff\xd8"  # first bytes of a JPEG image
@@ -86,7 +87,7 @@ def format_of(message: Any, kind: str) -> ImageFormat:
 
 
 def check_image(message: Any, expected: ImageFormat) -> None:
-    """Check an image message without decoding it, against the format of the first one of its topic.
+    """Check an image message, without decoding it, against the format of the first image of its topic.
 
     Raises:
         BrokenMessage: The image is truncated or damaged, or has another size or encoding.
@@ -94,7 +95,7 @@ def check_image(message: Any, expected: ImageFormat) -> None:
     if hasattr(message, "encoding"):
         if (message.width, message.height) != expected.size or message.encoding != expected.encoding:
             raise BrokenMessage(
-                f"an image is {message.width}x{message.height} {message.encoding}, unlike the first one"
+                f"an image is {message.width}x{message.height} {message.encoding}, unlike the first image"
             )
         _rows(message)
         return
@@ -110,7 +111,7 @@ def check_image(message: Any, expected: ImageFormat) -> None:
         raise BrokenMessage("an image is neither JPEG nor PNG")
     size = _coded_size(data)
     if size is not None and expected.size is not None and size != expected.size:
-        raise BrokenMessage(f"an image is {size[0]}x{size[1]}, unlike the first one")
+        raise BrokenMessage(f"an image is {size[0]}x{size[1]}, unlike the first image")
 
 
 def decode_colour(message: Any) -> npt.NDArray[np.uint8]:

@@ -25,6 +25,7 @@ _USUAL_NOISE = {"gyro_noise": 1e-3, "gyro_walk": 1e-4, "accel_noise": 6e-3, "acc
 times the noise densities in the data sheet of Bosch's BMI055 (0.014 degree/s/sqrt(Hz), 150 ug/sqrt(Hz)),
 because a robot shakes.  The random walk of the accelerations is that of EuRoC's IMU, the random walk of the
 rates is five times that of EuRoC's.  Units are those of `RigImu`."""
+# Action for an IMU that cannot be used.
 _HINT = "leave the IMU out with --no-imu, or give its place and noise with --intrinsics rig.json"
 
 
@@ -63,8 +64,8 @@ class ImuReadings:
     def sorted(self, *, use_log_time: bool) -> tuple[Array, Array]:
         """Return ascending times ``(n,)``, s, and rates (rad/s) and accelerations (m/s^2) ``(n, 6)``.
 
-        Of several samples with one time, the first is returned.  With *use_log_time*, the times are those of
-        writing, else the stamps.
+        Of several samples with one time, the first is returned.  With *use_log_time* the times are those at
+        which the messages were written to the bag, otherwise their time stamps.
         """
         stamps_ns = np.frombuffer(self._log_ns if use_log_time else self._stamps_ns, dtype=np.int64)
         unique, rows = np.unique(stamps_ns, return_index=True)
@@ -75,7 +76,7 @@ def numbers_of_imu(message: Any) -> tuple[float, ...]:
     """Return the three rates and three accelerations of a ``sensor_msgs/Imu``, rad/s and m/s^2.
 
     Raises:
-        BrokenMessage: The message states that it lacks some of them, or a number is not finite.
+        BrokenMessage: The message states that it has no rates or accelerations, or a number is not finite.
     """
     if message.angular_velocity_covariance[0] == -1 or message.linear_acceleration_covariance[0] == -1:
         raise BrokenMessage("a message of an IMU has no rates, or no accelerations")
@@ -145,7 +146,7 @@ def imu_track(
 
 
 def _noise(topic: str, stamps_s: Array, T_left_imu: Array | None, rig: Rig | None) -> tuple[RigImu, str]:
-    """Return pose and noise of the IMU, and a phrase on their source; raises UsageError without a pose."""
+    """Return pose and noise of the IMU, and a phrase on their source; a missing pose raises UsageError."""
     if rig is not None and rig.imu is not None:
         return rig.imu, "as the file of intrinsics states it"
     if T_left_imu is None:

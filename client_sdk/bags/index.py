@@ -1,7 +1,7 @@
 """Read a bag once, and collect time stamps, transforms, poses, IMU samples and the number of broken messages.
 
-Images are checked, but neither decoded nor kept: the memory grows by 16 bytes for an image, and by 64 for a
-sample of the IMU.
+Images are checked, but neither decoded nor kept: memory grows by 16 bytes for each image, and by 64 bytes for
+each sample of the IMU.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Stamps = npt.NDArray[np.int64]
 
 _MAX_STEP_MISMATCH = 0.5
 """Largest difference between a step back of the time stamps and the change of the latency there, as a share
-of the step, for a clock that was set back."""
+of the step, at which the clock counts as set back."""
 
 
 @dataclass(slots=True)
@@ -41,9 +41,9 @@ class ImageStamps:
         header_ns: ``(n,)``, time stamps in the messages.
         log_ns: ``(n,)``, times of writing to the bag.
         was_in_order: Whether the stamps ascended in the order of the bag.
-        copies: Number of images that were left out because another one has the same stamp.
+        copies: Number of images that were left out because another image has the same stamp.
         unstamped: Number of images that were left out because their stamp is 0.
-        clock_step_ns: Time by which the clock was set back in all; 0 if it was not.
+        clock_step_ns: Total time, nanoseconds, by which the clock of the stamps was set back; 0 if never.
     """
 
     stamps_ns: Stamps
@@ -66,8 +66,8 @@ class BagIndex:
         poses: The poses of the chosen topic.
         imu: The samples of the IMU.
         broken: Number of malformed messages, which were left out.
-        first_broken: Topic and error of the first of them.
-        ended: Why the bag could not be read to its end; "" if it was.
+        first_broken: Topic and error of the first malformed message.
+        ended: Why the bag could not be read to its end; "" if it was read to its end.
         uses_log_time: Whether times of writing replace the stamps, since all stamps of a topic are 0.
         cameras: The ``CameraInfo`` messages by name of the topic.
     """
@@ -105,9 +105,10 @@ class CameraTimes:
         self._logged.append(row)
 
     def row_at(self, stamp_ns: int, log_ns: int) -> int:
-        """Return the index in ``messages`` that is valid for an image.
+        """Return the index in ``messages`` of the message that is valid for an image.
 
-        That is the message with the stamp of the image, else the last one that was written before it.
+        This is the message with the stamp of the image, or otherwise the last message that was written before
+        the image.
         """
         if len(self.messages) < 2:
             return 0
@@ -152,8 +153,8 @@ def _continue_stamps(header_ns: Stamps, log_ns: Stamps) -> tuple[Stamps, int]:
     """Continue the time stamps where the clock was set back; return them, and the sum of the steps, ns.
 
     If the clock is set back, the latency from stamp to writing grows by the step in all later messages.  If
-    it does not, the messages were only written in another order; then the stamps stay as they are, and the
-    sum is 0.
+    the latency does not grow, the messages were only written in another order; then the stamps stay as they
+    are, and the sum is 0.
     """
     latency_ns = log_ns - header_ns
     steps = np.flatnonzero(np.diff(header_ns) < 0) + 1

@@ -15,6 +15,7 @@ from rse_pf.geometry import LENS_MODELS, Array, Camera, Lens, find_lens_model
 
 __all__ = ["lens_of", "lens_or_rig", "numbers_of"]
 
+# Action for a camera without a usable calibration.
 _HINT = "give the intrinsics yourself: --intrinsics intrinsics.json"
 
 
@@ -22,7 +23,7 @@ def lens_or_rig(file: Path) -> tuple[Lens | None, Rig | None]:
     """Read a file of intrinsics or of a rig; return (lens, None) or (None, rig) for `BagOptions`.
 
     Raises:
-        UsageError: The file is neither, or cannot be read.
+        UsageError: The file holds neither intrinsics nor a rig, or cannot be read.
     """
     own = read_calibration(file)
     return (own, None) if isinstance(own, Intrinsics) else (None, own)
@@ -31,7 +32,7 @@ def lens_or_rig(file: Path) -> tuple[Lens | None, Rig | None]:
 def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
     """Return the lens of a ``CameraInfo``: for rectified images from its matrix P, without distortion.
 
-    The message states the intrinsics of the whole sensor; those that are returned belong to the image, which
+    The message states the intrinsics of the whole sensor.  The returned intrinsics belong to the image, which
     is the region of interest after binning (REP 104).
 
     Raises:

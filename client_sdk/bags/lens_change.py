@@ -21,9 +21,10 @@ _Image = npt.NDArray[np.uint8]
 def mismatch_px(before: _Image, after: _Image, lens: Lens, other: Lens) -> tuple[float, float] | None:
     """Return the median errors, px, of a pure rotation between two images, under two hypotheses on the lens.
 
-    The first error holds if the lens changed from *lens* to *other* between the images.  The second holds if
-    it did not change; it is the smaller one of those with either lens.  The translation of the camera between
-    two images is neglected: it moves pixels less than a wrong focal length does at the border.
+    The first error assumes that the lens changed from *lens* to *other* between the images.  The second error
+    assumes an unchanged lens, and is the smaller one of the errors with *lens* and with *other*.  The
+    translation of the camera between two images is neglected: it moves pixels less than a wrong focal length
+    does at the border.
 
     Returns:
         None if the images have fewer than 30 matches.

@@ -1,8 +1,8 @@
 """Definitions of the ROS messages that bags are read and written with.
 
-They are the same in every distribution of ROS.  The definitions inside a bag are not used, so that a wrong
-one does no harm.  ROS 1 differs in two of them: a header has a sequence number, and the matrices of a
-``CameraInfo`` have capital names.
+The definitions are the same in every distribution of ROS.  Definitions inside a bag are not used, so that a
+wrong one does no harm.  ROS 1 differs from ROS 2 in two definitions: a header has a sequence number, and the
+matrices of a ``CameraInfo`` have capital names.
 """
 
 from __future__ import annotations

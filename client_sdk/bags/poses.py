@@ -17,7 +17,7 @@ __all__ = ["PoseTopic", "TransformTree"]
 
 _MAX_GAP_NS = 200_000_000
 """Longest time, nanoseconds, between two transforms between which a pose is interpolated."""
-_MAX_DEPTH = 64  # largest number of transforms from a frame to its root: stops at cycles
+_MAX_DEPTH = 64  # largest number of transforms from a frame to its root; ends the search in a cycle
 
 
 @dataclass(slots=True)
@@ -46,10 +46,10 @@ class _Edge:
         self.values.extend(numbers)
 
     def at(self, stamp_ns: int) -> Array | None:
-        """Return ``T_parent_child`` at a time, interpolated between its neighbours.
+        """Return ``T_parent_child`` at a time, interpolated between the transforms before and after it.
 
-        None without transforms, before the first or after the last one, or if its neighbours are more than
-        0.2 s apart.
+        The result is None without transforms, before the first and after the last transform, and if the
+        transforms before and after are more than 0.2 s apart.
         """
         if not self.stamps_ns:
             return None
@@ -115,7 +115,7 @@ class TransformTree:
         return None
 
     def between(self, frame: str, other: str) -> Array | None:
-        """Return ``T_frame_other`` of two frames that static transforms connect; None if none do."""
+        """Return ``T_frame_other`` of two frames that static transforms connect; None if they do not."""
         if frame.strip("/") == other.strip("/"):
             return np.eye(4)
         ways = [self._walk_fixed(end) for end in (frame, other)]
@@ -125,9 +125,9 @@ class TransformTree:
         return None
 
     def path(self, frame: str, stamps_ns: Sequence[int]) -> Trajectory | None:
-        """Return the poses of *frame* in its root at those of the times at which they are known.
+        """Return the poses of *frame* in its root frame at those *stamps_ns* at which they are known.
 
-        None if fewer than two are known.
+        The result is None if fewer than two poses are known.
         """
         return _path((stamp_ns, self.pose(frame, stamp_ns)) for stamp_ns in stamps_ns)
 
@@ -153,7 +153,7 @@ class PoseTopic:
         self._edge = _Edge(parent="", is_static=False)
 
     def add(self, message: Any) -> None:
-        """Add the pose of a message; one that is not finite or has no valid quaternion is left out."""
+        """Add the pose of a message; a pose with numbers not finite or an invalid quaternion is left out."""
         pose = message.pose
         pose = getattr(pose, "pose", pose)
         stamp = message.header.stamp
@@ -161,9 +161,9 @@ class PoseTopic:
         self._edge.add(stamp_ns, pose.position, pose.orientation)
 
     def path(self, stamps_ns: Sequence[int]) -> Trajectory | None:
-        """Return the interpolated poses at those of the times at which they are known.
+        """Return the interpolated poses of the topic at those *stamps_ns* at which they are known.
 
-        None if fewer than two are known.
+        The result is None if fewer than two poses are known.
         """
         return _path((stamp_ns, self._edge.at(stamp_ns)) for stamp_ns in stamps_ns)
 

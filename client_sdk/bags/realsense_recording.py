@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, from_quaternion, inverse
 
 __all__ = ["stated_T_colour_depth", "stated_depth_unit_m"]
 
-_IMAGES = "/image/data"  # ending of the topics of images
+_IMAGES = "/image/data"  # ending of the names of image topics
 
 
 def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:
@@ -53,7 +53,7 @@ def _stream_of(topic: str) -> str:
 def _first(file: BagFile, start: str, kind: str) -> Any | None:
     """Return the first message of the topics of type *kind* whose names begin with *start*.
 
-    None if there is none, or if it is malformed.
+    The result is None without such a message, or if it is malformed.
     """
     names = [topic.name for topic in file.topics if topic.kind == kind and topic.name.startswith(start)]
     try:

@@ -14,11 +14,12 @@ from rse_pf.geometry import Array, inverse, rigid
 
 __all__ = ["CameraMessage", "pair_of"]
 
+# Action for a stereo pair without a usable calibration.
 _HINT = "give both cameras yourself: --intrinsics rig.json; or take one: --no-depth"
 _MAX_COEFFICIENTS = 5
-"""Largest number of distortion coefficients that are not 0 of a camera in a rig."""
+"""Largest number of distortion coefficients other than 0 of a camera in a stereo pair."""
 
-_MAX_BASELINE_M = 10.0  # largest distance, metres, of both cameras: a larger one is in a wrong unit
+_MAX_BASELINE_M = 10.0  # largest distance, metres, between both cameras; a larger one is in a wrong unit
 
 CameraMessage = tuple[str, Any, bool]
 """A camera of a bag: the name of its ``CameraInfo`` topic, the message, and whether its images are rectified
@@ -87,7 +88,8 @@ def _rectified_from(name: str, message: Any, is_rectified: bool) -> Array:
 def _baseline_of(name: str, message: Any) -> Array:
     """Return the translation ``(2,)``, metres, that P of a camera states: ``P[3] / fx`` and ``P[7] / fy``.
 
-    It takes points of the rectified left camera to this one; 0 if P states no focal lengths.
+    This translation maps points of the rectified left camera into this camera; it is 0 if P states no focal
+    lengths.
     """
     P = numbers_of(message, "p")
     if not np.isfinite(P).all():

@@ -1,6 +1,6 @@
 """Fetch raw images of a bag by their time stamps; ascending stamps are read without seeking.
 
-Messages that were read before they are wanted are kept, at most `_MAX_WAITING_BYTES` of them.
+Messages that were read before they are wanted are kept, up to a total size of `_MAX_WAITING_BYTES`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ nanoseconds."""
 
 _MAX_WAITING_BYTES = 64 * 1024 * 1024  # largest size of the messages that are kept for later calls
 _MAX_READ_THROUGH_NS = 2_000_000_000
-"""Longest gap, nanoseconds, that is read through; over longer ones, seeking is faster."""
+"""Longest gap in time, nanoseconds, over which the bag is read through; over longer gaps, seeking is
+faster."""
 
 
 class ImageStream:
@@ -40,7 +41,7 @@ class ImageStream:
     def take(self, wanted: Sequence[WantedImage]) -> list[RawMessage]:
         """Return the messages of the *wanted* images in their order.
 
-        Kept messages up to the oldest of their time stamps are dropped.
+        Kept messages up to the oldest time stamp of the *wanted* images are dropped.
 
         Raises:
             UsageError: The bag no longer holds one of the messages: it has changed.
@@ -78,9 +79,10 @@ class ImageStream:
         self._at_ns = start_ns
 
     def _read(self, missing: dict[WantedImage, int], until_ns: int | None) -> bool:
-        """Read on until no image is *missing*, and return whether that succeeded.
+        """Read messages until no image is *missing*, and return whether all of them were found.
 
-        False at the end of the bag, at damage, or after the first message that was written after *until_ns*.
+        The result is False at the end of the bag, at damage, or after the first message that was written
+        after *until_ns*.
         """
         assert self._messages is not None
         while missing:

@@ -102,8 +102,8 @@ def write_map_bag(
     ``PointCloud2`` with colours.  Times of messages are those of the trajectories.
 
     Args:
-        path: File or folder of the new bag.  A path with the ending of a file of a ROS 2 bag gets that file
-            alone, without a folder.
+        path: File or folder of the new bag.  If the path has the ending of a file of a ROS 2 bag, only this
+            file is written, without a folder.
         kind: Format of the bag.
         trajectories: Names of robots with their trajectories.
         points: ``(n, 3)``, metres.

@@ -29,7 +29,9 @@ from rse_pf.slam.self_calibration import (
 
 __all__ = ["CalibrationCheck", "check_calibration"]
 
-_FX, _FY, _CX, _CY, _K1, _OFFSET, _DELAY = range(7)  # indices of the first seven `UNKNOWNS`
+# Indices in `UNKNOWNS` of the errors of the camera, of the offset of depths, and of the delay of depth
+# images.
+_FX, _FY, _CX, _CY, _K1, _OFFSET, _DELAY = range(7)
 # Errors of the calibration that are estimated for a drive without depth images.
 _COLOUR_UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "readout")
 # Fewest keyframes, and fewest poses of a camera without depth, with which a calibration is checked.
@@ -53,26 +55,30 @@ _MAX_BOUNDS = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
 error: if its bound is larger, the fault is listed as one that the drive cannot show."""
 # Smallest rotation of the camera about an axis, degrees, that determines focal length and principal point.
 _MIN_ROTATION_DEG = 12.0
-# Factor on the deviations between parts of a drive, which two to four parts often underestimate.
+# Factor on the standard deviations between parts of a drive, which two to four parts often underestimate.
 _PART_INFLATION = 1.5
-# Share of an error's standard deviation from which the parts of the drive are named as its reason.
+# Smallest share of an error's standard deviation that comes from differences between parts of the drive from
+# which these differences are named as the reason why the drive does not determine the error.
 _MIN_PART_SHARE = 0.7
-_MIN_CORRELATION = 0.8  # absolute correlation from which two errors of the calibration count as confused
+# Smallest absolute correlation of two errors of the calibration that a drive does not separate.
+_MIN_CORRELATION = 0.8
 # Smallest motion of the camera, as a share of the distance of the scene, that determines a calibration.
 _MIN_MOVED_SHARE = 0.01
 # Smallest motion of the camera, as a share of the distance of the scene, that determines an offset of depths.
 _MIN_MOVED_SHARE_FOR_OFFSET = 0.06
-_MAX_DEPTH_FACTOR = 2.0  # `Calibrated.depth_factor` above which depth noise is named as the reason
-_MIN_DEPTH_SHARE = 0.2  # share of features with a depth below which missing depths are named as the reason
-# Indices of the unknowns that belong to each fault.
-_ROWS = {
+# `Calibrated.depth_factor` above which depth noise is named as the reason of uncertainty.
+_MAX_DEPTH_FACTOR = 2.0
+# Share of features with a depth below which missing depths are named as the reason of uncertainty.
+_MIN_DEPTH_SHARE = 0.2
+# For each fault of a calibration the indices in `UNKNOWNS` of its errors.
+_UNKNOWNS_OF_FAULT = {
     FaultKind.FOCAL_LENGTH: (_FX, _FY), FaultKind.PRINCIPAL_POINT: (_CX, _CY),
     FaultKind.DISTORTION: (_K1,), FaultKind.DEPTH_OFFSET: (_OFFSET,), FaultKind.DEPTH_DELAY: (_DELAY,),
 }  # fmt: skip
 # Faults of the colour camera, which are checked in every drive.
 _COLOUR_FAULTS = (FaultKind.FOCAL_LENGTH, FaultKind.PRINCIPAL_POINT, FaultKind.DISTORTION)
-_UNITS = ("%", "%", "px", "px", "", "cm", "s")  # in which messages state the first seven unknowns
-_UNIT_FACTORS = (100.0, 100.0, 1.0, 1.0, 1.0, 100.0, 1.0)  # from the unit of an unknown to `_UNITS`
+_UNITS = ("%", "%", "px", "px", "", "cm", "s")  # units in which messages state the first seven `UNKNOWNS`
+_UNIT_FACTORS = (100.0, 100.0, 1.0, 1.0, 1.0, 100.0, 1.0)  # factors from the units of `UNKNOWNS` to `_UNITS`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -183,7 +189,7 @@ def _causes(
     """
     kinds = list(_COLOUR_FAULTS) if is_one_camera else []
     kinds += [FaultKind.DEPTH_OFFSET, FaultKind.DEPTH_DELAY] if has_depth and not reading.flip else []
-    return {kind: _ROWS[kind] for kind in kinds}
+    return {kind: _UNKNOWNS_OF_FAULT[kind] for kind in kinds}
 
 
 def _measured(
@@ -212,10 +218,10 @@ def _measured(
 def _adjust_drive(
     store: KeyframeStore, tracks: Tracks, reading: DepthReading, free: tuple[str, ...]
 ) -> tuple[DriveModel | None, Calibrated | None, DepthReading]:
-    """Adjust a drive, and repeat it with the depth images at the estimated delay until that is stable.
+    """Adjust a drive, and repeat the adjustment with the estimated delay of depth until the delay is stable.
 
-    The model and the adjustment are None if too few keyframes connect; the reading is the one that was used
-    last.
+    Returns the model, the adjustment, and the flip and delay of the depth images with which they were made;
+    model and adjustment are None if too few keyframes connect.
     """
     by_depth = store.has_depth or store.has_stereo
     reading = DepthReading(reading.flip, nearest_delay(store.keyframes, reading.delay_s))
@@ -234,7 +240,7 @@ def _adjust_drive(
 
 
 def _depth_error_factor(adjusted: Calibrated) -> float:
-    """Return the ratio of this drive's depth noise to that of a Kinect, at least 1."""
+    """Return the ratio of the depth noise of the drive to that of a Kinect, at least 1."""
     return max(1.0, adjusted.depth_factor / _KINECT_DEPTH_FACTOR)
 
 
@@ -242,7 +248,7 @@ def _findings(
     measured: Measured, causes: tuple[FaultKind, ...], accepted: list[FaultKind], adjusted: Calibrated,
     model: DriveModel, reading: DepthReading,
 ) -> list[Finding]:  # fmt: skip
-    """Return a finding for each of the *accepted* causes that is certain and matters, and one for a flip.
+    """Return findings on the *accepted* causes that are certain and matter, and on flipped depth images.
 
     *causes* are all causes that explain the drive; *accepted* are those without a rival that explains the
     drive nearly as well.
@@ -281,7 +287,7 @@ class _Errors:
         """
         rows = [
             row
-            for row in _ROWS[kind]
+            for row in _UNKNOWNS_OF_FAULT[kind]
             if abs(self.values[row]) > max(3.0 * self.deviations[row], _MIN_ERRORS[row])
         ]
         wrong = np.zeros(len(UNKNOWNS))
@@ -291,21 +297,21 @@ class _Errors:
         return (rows if is_kept else []), cost_m
 
     def with_the_other(self, rows: list[int]) -> list[int]:
-        """Return the focal lengths to correct, of those in *rows* that are certain and the other one.
+        """Return the indices of the focal lengths to correct: *rows*, and the focal length of the other axis.
 
-        The other one is added if its error has the same sign and exceeds one standard deviation.  Correcting
-        one of two wrong focal lengths alone bends a map more: 7.4 cm instead of 6.5 cm where both were 6 %
-        too small.
+        *rows* are the focal lengths whose errors are certain.  That of the other axis is added if its error
+        has the same sign and exceeds one standard deviation.  Correcting one of two wrong focal lengths alone
+        bends a map more: 7.4 cm instead of 6.5 cm where both were 6 % too small.
         """
         first = self.values[rows[0]]
         return [
             row
-            for row in _ROWS[FaultKind.FOCAL_LENGTH]
+            for row in _UNKNOWNS_OF_FAULT[FaultKind.FOCAL_LENGTH]
             if row in rows or self.values[row] * np.sign(first) > self.deviations[row]
         ]
 
     def worst(self, rows: list[int]) -> int:
-        """Return the one of *rows* whose error is largest relative to its standard deviation."""
+        """Return the index among *rows* whose error is largest relative to its standard deviation."""
         return max(rows, key=lambda row: abs(self.values[row]) / self.deviations[row])
 
 
@@ -432,11 +438,11 @@ class _Drive:
 
 
 def _kinds(*, has_depth: bool) -> tuple[FaultKind, ...]:
-    return tuple(_ROWS) if has_depth else _COLOUR_FAULTS
+    return tuple(_UNKNOWNS_OF_FAULT) if has_depth else _COLOUR_FAULTS
 
 
 def _undetermined(shown: str, *, has_depth: bool) -> CalibrationCheck:
-    """Return a check without findings that gives "the drive has *shown*" as the reason for each fault."""
+    """Return a check without findings, with the reason "the drive has *shown*" for each possible fault."""
     return CalibrationCheck(
         cannot_tell=tuple(CannotTell(kind, f"the drive has {shown}") for kind in _kinds(has_depth=has_depth))
     )
@@ -474,7 +480,7 @@ def _undetermined_faults(
             continue
         _, covariance = drive.measured.under([*drive.explanation.causes, kind])
         deviations = np.sqrt(np.diag(covariance))
-        row = max(_ROWS[kind], key=lambda each: deviations[each] / _MAX_BOUNDS[each])
+        row = max(_UNKNOWNS_OF_FAULT[kind], key=lambda each: deviations[each] / _MAX_BOUNDS[each])
         within = 3.0 * float(deviations[row])
         of = next((cause for cause, others in rivals.items() if others and kind in (cause, *others)), None)
         if of is not None:
@@ -495,22 +501,23 @@ def _undetermined_by_zoom(kinds: list[FaultKind], hint: float) -> Iterator[Canno
 
 
 def _equal_explanations(drive: _Drive, cause: FaultKind, row: int) -> str:
-    """Return a sentence on *cause* and its rivals, which explain the drive equally well."""
+    """Return a sentence that names *cause* and the other faults that explain the drive equally well."""
     alike = (cause, *drive.explanation.rivals[cause])
     before = [each for each in drive.explanation.causes if each is not cause]
     explanations = []
     for kind in alike:
         values, _ = drive.measured.under([*before, kind])
-        worst = max(_ROWS[kind], key=lambda each: abs(values[each]) / _MIN_ERRORS[each])
+        worst = max(_UNKNOWNS_OF_FAULT[kind], key=lambda each: abs(values[each]) / _MIN_ERRORS[each])
         value = _UNIT_FACTORS[worst] * float(values[worst])
         explanations.append(f"{kind.value} ({UNKNOWNS[worst]} by {value:+.3g} {_UNITS[worst]}".rstrip() + ")")
     return f"the drive is explained equally well by {' and by '.join(explanations)}"
 
 
 def _reason(row: int, deviation: float, drive: _Drive) -> str:
-    """Return why the unknown *row* is uncertain by *deviation*: what the drive lacks, with a number.
+    """Return why the error with the index *row* of `UNKNOWNS` has the standard deviation *deviation*.
 
-    The first reason that applies is returned, beginning with a camera that does not move.
+    The result names a lack of the drive with a number.  Reasons are tried in order, beginning with a camera
+    that does not move, and the first that applies is returned.
     """
     adjusted, model = drive.adjusted, drive.model
     yaw, pitch, roll = _rotation_ranges_deg(adjusted)
@@ -544,7 +551,7 @@ def _reason(row: int, deviation: float, drive: _Drive) -> str:
             f"these views do not separate {UNKNOWNS[row]} from {UNKNOWNS[other]} "
             f"(correlation {correlation[other]:+.2f})"
         )
-    return f"{len(adjusted.points_world)} landmarks in {len(model.rows)} views do not tell more"
+    return f"{len(adjusted.points_world)} landmarks in {len(model.rows)} views do not determine more"
 
 
 def _moved_share(adjusted: Calibrated) -> float:
@@ -559,7 +566,7 @@ def _moved_share(adjusted: Calibrated) -> float:
 
 
 def _correlations(covariance: Array, row: int) -> Array:
-    """Return ``(n,)`` correlations of the unknown *row* with all unknowns; its own entry is 0."""
+    """Return the correlations ``(n,)`` of the unknown *row* with all *n* unknowns, 0 for itself."""
     deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     correlations: Array = covariance[row] / (deviations * deviations[row])
     correlations[row] = 0.0
@@ -567,7 +574,7 @@ def _correlations(covariance: Array, row: int) -> Array:
 
 
 def _bound(row: int, within: float) -> str:
-    """Return the bound *within* of the error of an unknown, as a phrase with its name and unit."""
+    """Return the bound *within* of the error *row* of `UNKNOWNS` as a phrase with its name and unit."""
     if row in (_FX, _FY):
         return f"{UNKNOWNS[row]} within {within:.0%}"
     if row in (_CX, _CY):

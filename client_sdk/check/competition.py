@@ -32,8 +32,8 @@ class Measured:
     Attributes:
         values: ``(n,)``, the estimated errors.
         covariance: ``(n, n)`` of the estimate.
-        unknown: ``(n,)``, standard deviations of what the model of the estimate lacks, which remain in every
-            drive.
+        unknown: ``(n,)``, standard deviations of effects that the model of the estimate leaves out; they
+            remain in every drive.
         usual: ``(n,)``, standard deviations of the errors of a good calibration.  They cannot be separated
             from *unknown*: `left` takes the larger of both, not their sum.
         widest: ``(n,)``, standard deviations of errors that are faults.
@@ -78,8 +78,8 @@ class Measured:
 class Explanation:
     """The faults that explain the estimated errors of a calibration.
 
-    ``causes`` are the selected faults, the one that explains most first.  ``rivals`` maps each of them to the
-    faults that explain nearly as much instead of it, and nothing in addition to it.
+    ``causes`` are the selected faults; the fault that explains most is the first.  ``rivals`` maps each
+    selected fault to the faults that explain nearly as much in its place, and nothing in addition to it.
     """
 
     causes: tuple[FaultKind, ...] = ()
@@ -87,7 +87,7 @@ class Explanation:
 
 
 def explain(measured: Measured) -> Explanation:
-    """Select faults greedily, until no further one lowers the squared distance by `_MIN_GAIN`."""
+    """Select faults greedily, until no other lowers the squared Mahalanobis distance by `_MIN_GAIN`."""
     found: list[FaultKind] = []
     rivals: dict[FaultKind, tuple[FaultKind, ...]] = {}
     while True:
@@ -96,7 +96,7 @@ def explain(measured: Measured) -> Explanation:
         best = min(left, key=lambda name: left[name], default=None)
         if best is None or measured.left(found) - left[best] < _MIN_GAIN:
             return Explanation(causes=tuple(found), rivals=rivals)
-        # A fault that explains something in addition to the best one is a second fault, not a rival.
+        # A fault that explains errors in addition to the best fault is a second fault, not a rival.
         rivals[best] = tuple(
             name
             for name in others

@@ -11,8 +11,8 @@ from rse_pf.geometry import Camera
 
 __all__ = ["corrected"]
 
-_CAMERA = ("fx", "fy", "cx", "cy")  # corrections of the pinhole camera, px
-_MODEL = "radial-tangential"  # lens model whose ``k1`` a correction of the distortion is
+_CAMERA = ("fx", "fy", "cx", "cy")  # intrinsics of the pinhole camera, px, that a correction may replace
+_MODEL = "radial-tangential"  # the lens model whose coefficient ``k1`` a correction of the distortion gives
 
 
 def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intrinsics, tuple[str, ...]]:

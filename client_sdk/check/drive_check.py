@@ -25,7 +25,7 @@ _T = TypeVar("_T")
 def check_lines(
     report: Mapping[str, Any], *, is_whole: bool = False, shown: Collection[str] = ()
 ) -> list[str]:
-    """Return the lines of text that show the result of a check: one for each finding, with its fix.
+    """Return the result of a check as lines of text: one line for each finding, with the action against it.
 
     Args:
         report: The result, as `CheckReport.to_dict` returns it.
@@ -51,10 +51,10 @@ def check_lines(
             f"check: none of {report.get('frames')} frames got a pose: the calibration is not checked"
         )
     elif not findings:
-        vague = "" if is_whole or not kinds else f"; this drive cannot tell {', '.join(kinds)}"
+        vague = "" if is_whole or not kinds else f"; this drive does not determine {', '.join(kinds)}"
         lines.append(f"check: nothing wrong found in {report.get('frames')} frames{vague}")
     if is_whole:
-        lines += [f"cannot tell {each.get('kind')}: {each.get('reason')}" for each in undetermined]
+        lines += [f"{each.get('kind')} is not determined: {each.get('reason')}" for each in undetermined]
         lines += [f"note: {each}" for each in report.get("notes") or []]
     return lines
 
@@ -62,8 +62,7 @@ def check_lines(
 class DriveCheck:
     """Run a `DriveObserver` while a map is made.
 
-    The first exception that the observer raises stops the check; it is kept as a line of text, and is not
-    raised.
+    The first exception of the observer stops the check, and is reported in its result instead of raised.
     """
 
     def __init__(self, *, is_wanted: bool, is_thinned: bool = False) -> None:
@@ -74,7 +73,7 @@ class DriveCheck:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether the check still runs: it was wanted, and no error has stopped it."""
+        """Whether the check still runs: the user wants the check, and no error has stopped it."""
         return self._observer is not None
 
     def add(self, frame: Frame, tracked: TrackedFrame) -> None:

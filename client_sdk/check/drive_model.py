@@ -26,7 +26,7 @@ _MIN_KEYFRAMES = 5  # fewest connected keyframes of a drive that is adjusted
 _PNP = PnpOptions(inlier_px=8.0, max_iterations=100)
 """Options of PnP for the initial poses.  The inlier threshold is wide, since wrong intrinsics cause residuals
 of some pixels."""
-_PIXEL_SIGMA_PX = 0.7  # standard deviation of the pixel of a feature of size 1
+_PIXEL_SIGMA_PX = 0.7  # standard deviation of the position of a feature of size 1, pixels
 # Smallest share of the known landmarks of a keyframe that must be inliers of its initial pose.
 _MIN_INLIER_SHARE = 0.3
 # Largest difference, seconds, between the stamp of a depth image and the time at which a depth is wanted.
@@ -34,16 +34,16 @@ _MAX_STAMP_DIFFERENCE_S = 0.07
 # Largest rate of a depth, m/s; faster changes are an edge of an object, and count as a rate of 0.
 _MAX_RATE_M_S = 3.0
 _RATE_WINDOWS_S = (0.3, 0.2, 0.1)
-"""Times, in seconds before and after a depth image, between whose depths a rate is computed.  The first one
-with depths at both of its ends is used."""
-# Factors on the focal length that are tried if no pose is found: the frame may be of another camera.
+"""Times, in seconds before and after a depth image, between whose depths a rate of change is computed.  The
+longest time with depths at both of its ends is used."""
+# Factors on the focal length that are tried for a keyframe without a pose, which may be of another camera.
 _FOCAL_LENGTH_FACTORS = (1.25, 0.8)
 _MAX_COST = 6.0
 """Largest cost of one observation in the score of a reading, and the cost of each observation of a keyframe
 whose pose was not found.  Costs have no unit."""
 _SCORE_SCALE_PX = 3.0  # reprojection error, pixels, that counts as 1 before the logarithm of the score
-_SCORE_SCALE_SIGMAS = 4.0  # error of a depth, in standard deviations, that counts as 1 in the score
-_DELAYS_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)  # delays of the depth images that are tried
+_SCORE_SCALE_SIGMAS = 4.0  # error of a depth, in standard deviations, that counts as 1 before that logarithm
+_DELAYS_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)  # delays of the depth images that are tried, seconds
 _MAX_COST_RATIO = 0.9
 """A flip or a delay of the depth images is accepted if its score is below this share of the score of the
 depth images as they are."""
@@ -78,7 +78,8 @@ class DriveModel:
 def best_reading(keyframes: list[Keyframe], tracks: Tracks) -> DepthReading:
     """Return the flip or the delay of the depth images with the lowest score.
 
-    That is the plain reading (no flip, no delay) unless another one has less than 0.9 times its score.
+    The result is the plain reading (no flip, no delay) unless another reading has less than 0.9 times the
+    score of the plain reading.
     """
     readings = [DepthReading(flip) for flip in range(1, len(FLIPS))]
     readings += [DepthReading(delay_s=delay_s) for delay_s in _DELAYS_S]
@@ -116,9 +117,9 @@ def drive_model(
 
     Args:
         keyframes: The keyframes of the drive, in the order of time.
-        tracks: Which of their features show the same landmark.
+        tracks: The features of these keyframes that show the same landmark.
         reading: Flip and delay of the depth images.
-        by_depth: Whether the initial poses come from PnP with depths; else they are the tracked ones.
+        by_depth: Whether the initial poses come from PnP with depths; otherwise they are the tracked poses.
     """
     camera = keyframes[0].camera
     at, depths, rates = _gather_depths(keyframes, tracks, reading)
@@ -164,7 +165,7 @@ def _score(keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading) -> 
 def _gather_depths(
     keyframes: list[Keyframe], tracks: Tracks, reading: DepthReading
 ) -> tuple[Rows, Array, Array]:
-    """Return ``(n,)`` each, for the features of the tracks: index, depth in metres, and rate in m/s.
+    """Return three arrays ``(n,)`` for the features of the tracks: index, depth (m), and its change (m/s).
 
     The index counts the features of all keyframes, one keyframe after another.
     """

@@ -35,7 +35,7 @@ class FaultKind(str, Enum):
     - ``blur``, ``dark``, ``repeated``, ``missing``: share of the frames, 0..1
     - ``jitter``: standard deviation of the interval between frames, relative to the interval
     - ``two_cameras``, ``moving_focal_length``: relative difference of the focal lengths
-    - ``mirrored``, ``swapped_axes``: 1
+    - ``mirrored``, ``swapped_axes``: 1, since these faults have no size
     - ``swapped_cameras``, and a ``baseline`` or ``stamp_delay`` that was found by comparing the two images of
       stereo pairs: the value of `client_sdk.rigs.stereo_pair_checks.PairFault`
     """
@@ -75,13 +75,13 @@ class Finding:
         kind: Kind of the fault.
         value: Size of the fault in *unit*, see `FaultKind`.  For a relative error, +0.1 means that a setting
             is 10 % too large, and 4.0 that it is five times what it should be.
-        deviation: Standard deviation of *value*, in *unit*; 0 if the value was counted or needs none.
+        deviation: Standard deviation of *value*, in *unit*; 0 if the value was counted exactly.
         unit: ``relative``, ``share``, ``px``, ``m``, ``s`` or empty.
         cost_m: How far the fault bends the trajectory, metres; None if unknown.
         sentence: What is wrong and by how much, with the deviation.
         fix: What the user should do.
-        correction: Keys of ``intrinsics.json`` and the numbers that they should have; empty if the fault is
-            not in that file.
+        correction: Keys of ``intrinsics.json`` with their correct numbers; empty if that file does not cause
+            the fault.
 
     Raises:
         UsageError: A number is not finite, or the deviation or the cost is below 0.
@@ -125,7 +125,8 @@ class CannotTell:
 
     Attributes:
         kind: The kind of the fault.
-        reason: What the drive lacks, such as "no turn about the vertical axis: focal length within 6 %".
+        reason: What the drive lacks to determine the fault, such as "no turn about the vertical axis: focal
+            length within 6 %".
         within: Bound of the absolute error that the drive does determine, in the unit of a finding of that
             kind; None if there is no bound.
     """
@@ -173,7 +174,7 @@ class CheckReport:
 
 
 def matters(cost_m: float, noise_m: float) -> bool:
-    """Return whether a fault bends a path by more than 2 mm and more than 1.2 times its uncertainty.
+    """Return whether a fault bends a path by more than 2 mm and more than 1.2 times the path's uncertainty.
 
     Args:
         cost_m: How far the fault bends the path, metres.

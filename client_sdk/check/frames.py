@@ -19,11 +19,15 @@ from rse_pf.native import address_of, core_function
 __all__ = ["FrameStatistics", "sharpness"]
 
 _Image = npt.NDArray[np.uint8]
+# Action of findings on blurred images.
 _SHARPEN = "drive more slowly, shorten the exposure or add light, and focus the lens"
+# Action of findings on dark images.
 _LIGHTEN = "add light, lengthen the exposure, or uncover the lens"
+# Action for images with too few edges.
 _SHOW_TEXTURE = "point the camera at things with texture, not at a bare wall or the sky alone"
 
-_SAMPLED_LINES = 60  # about this many rows, and as many columns, are searched for edges: bounds the time
+# Approximate number of rows, and of columns, that are searched for edges: bounds the time.
+_SAMPLED_LINES = 60
 _THUMBNAIL_PX = 32  # approximate side, in pixels, of the thumbnails with which successive images are compared
 _EDGE_HALF_WIDTH_PX = 8  # half of the distance, in pixels, over which the contrast of an edge is measured
 _MIN_EDGE_STEP = 16  # smallest contrast of an edge, in grey levels of 255: noise has less
@@ -35,8 +39,8 @@ _MIN_SHARPNESS = 0.31  # below this `sharpness`, an edge is wider than about 7 p
 _MIN_SHARPNESS_RATIO = 0.6
 _NEIGHBOURS = 15  # number of frames before, and after, a frame with which its sharpness is compared
 _MAX_DARK_LEVEL = 40  # an image is dark if 98 % of its pixels are below this grey level of 255
-_MIN_FRAMES = 10  # fewest frames, and fewest intervals, with which a drive is checked
-# Smallest share of faulty frames that is reported.
+_MIN_FRAMES = 10  # fewest frames, and fewest intervals between frames, with which a drive is checked
+# Smallest share of the frames with a fault, by kind of the fault, that is reported.
 _MIN_SHARES = {FaultKind.BLUR: 0.3, FaultKind.DARK: 0.05, FaultKind.REPEATED: 0.05, FaultKind.MISSING: 0.05}
 _MIN_FAULTY_FRAMES = 3  # smallest number of faulty frames, or of gaps, that is reported
 # A run of equal images is a fault if the next change is at least this share of the median change: after a
@@ -50,7 +54,7 @@ _MIN_FROZEN_JUMP = 1.7
 _MIN_COMMON_CAUSE_SHARE = 0.5
 # Largest distance of 90 % of the intervals from a multiple of the camera's interval, as a share of it.
 _MAX_INTERVAL_ERROR = 0.15
-# smallest standard deviation of the intervals, as a share of the interval, that is a fault
+# Smallest standard deviation of the intervals between frames, as a share of the interval, that is a fault.
 _MIN_JITTER = 0.15
 _MAX_GAP_INTERVALS = 50.0  # a longer gap, in intervals of the camera, is a pause and not missing frames
 
@@ -58,7 +62,8 @@ _MAX_GAP_INTERVALS = 50.0  # a longer gap, in intervals of the camera, is a paus
 class FrameStatistics:
     """Collect sharpness, brightness, change and time stamp of each frame, and find faults in them.
 
-    An image takes about a millisecond; five numbers of each image are kept, and a thumbnail of the last one.
+    Processing an image takes about a millisecond.  Of each image only five numbers are kept, of the last one
+    also a thumbnail.
     """
 
     def __init__(self, *, is_thinned: bool = False) -> None:
@@ -82,9 +87,10 @@ class FrameStatistics:
         steps = [max(1, side // _THUMBNAIL_PX) for side in green.shape]
         small = rgb[:: steps[0], :: steps[1]].astype(np.int16)
         last = self._last
-        self._change.append(
-            math.inf if last is None or last.shape != small.shape else float(np.abs(small - last).mean())
-        )
+        change = math.inf if last is None or last.shape != small.shape else float(np.abs(small - last).mean())
+        if change == 0.0 and (small == small[0, 0]).all():
+            change = math.nan  # two images of one colour, dark or overexposed, do not show a repetition
+        self._change.append(change)
         self._last = small
         self._stamps_s.append(timestamp_s)
         self._bright.append(_percentile(small[:, :, 1], 98))
@@ -165,7 +171,8 @@ class FrameStatistics:
     def repeated(self) -> npt.NDArray[np.bool_]:
         """Return which frames ``(n,)`` repeat the image of the frame before although the camera moves.
 
-        Only runs of at most 10 repeated images count; `frozen` finds longer ones.
+        Only runs of at most 10 repeated images count; `frozen` finds longer ones.  Images of one colour, such
+        as white or black ones, are never counted as repeated.
         """
         change = np.array(self._change)
         moving = change[(change > 0.0) & np.isfinite(change)]
@@ -314,8 +321,8 @@ def _core_edges() -> Any:
 def _interval_s(steps_s: Array) -> float:
     """Return the interval between two frames of the camera, seconds, from the steps of its time stamps.
 
-    That is the percentile of *steps_s* ``(n,)`` (50, 35 or 20) of which 90 % of the steps are nearly
-    multiples; without one, the median.
+    The interval is a percentile (the 50th, 35th or 20th) of *steps_s* ``(n,)``: the first one of which 90 %
+    of the steps are nearly integer multiples, and the median if no percentile fulfils this.
     """
     for percent in (50, 35, 20):
         interval_s = float(np.percentile(steps_s, percent))

@@ -35,15 +35,16 @@ _CANDIDATE_INTERVAL_S = 0.19  # shortest time, seconds, between two frames that 
 _MIN_MOVED_SHARE = 0.025
 """Smallest median motion of the features since the last keyframe, as a share of the image width, of a new
 keyframe.  It grows by a factor of 1.6 each time that half of the keyframes are removed."""
-# Fewest features of a keyframe; a frame with fewer matches to the last keyframe always becomes one.
+# Fewest features of a keyframe; a frame with fewer matches to the last keyframe always becomes a keyframe.
 _MIN_FEATURES = 60
 _MAX_KEYFRAMES = 56  # above this number every second keyframe is removed: bounds memory and time
-_MAX_RATE_RAD_S = 3.0  # rotations faster than this, in rad/s, are errors of tracking: the twist counts as 0
+_MAX_RATE_RAD_S = 3.0  # a faster rotation, in rad/s, is an error of tracking: the twist counts as 0
 _DEPTH_WINDOW_S = 0.42  # depth images within this time, seconds, before and after a keyframe are sampled
 _MAX_DEPTH_SPREAD = 0.05  # relative range of neighbouring depths above which a pixel lies on an edge
 _MATCH_RATIO = 0.8  # largest ratio of the distances to the best and to the second best descriptor of a match
 _EPIPOLAR_PX = 3.0  # largest distance of a match from its epipolar line, pixels
-_MATCHED_OFFSETS = (1, 2, 3, 5, 8)  # each keyframe is matched with the keyframes this many places before it
+# Numbers of keyframes by which those keyframes precede a keyframe with which it is matched.
+_MATCHED_OFFSETS = (1, 2, 3, 5, 8)
 _MIN_MATCHES = 12  # fewest matches of two keyframes, before and after outlier rejection
 
 
@@ -60,12 +61,12 @@ class Keyframe:
         descriptors: ORB descriptors of the features, one row each.
         depths_m: ``(4, n)``, depths at the features for each of `FLIPS`, metres; NaN without a valid depth
             or on an edge.  A stereo pair has depths in the first row only.
-        noise: Noise model of these depths.
+        noise: Noise model of ``depths_m``.
         twist_s: ``(6,)``, translation (m) and rotation (rad) per second of the twist that multiplies
             ``T_camera_world`` on the left; 0 where it is not known.
         T_world_camera: The tracked pose ``(4, 4)``; None if tracking was lost.
-        around: Pairs of a time difference, seconds after this frame (negative for before), and the depths
-            ``(n,)`` at its features in the depth image of that time, metres.
+        around: Depths at other times: pairs of a time, seconds after this frame (negative: before), and the
+            depths ``(n,)`` at the features of this frame in the depth image of that time, metres.
     """
 
     row: int
@@ -119,7 +120,7 @@ class KeyframeStore:
             self._moved_share *= 1.6
 
     def _update_twist(self, stamp_s: float, T_world_camera: Array | None) -> None:
-        """Compute the twist of the camera from the last frame to this one, 0 without two poses in a row.
+        """Compute the twist of the camera from the last frame to this frame; 0 if one of them has no pose.
 
         If the last frame is a keyframe, its twist becomes the mean of the twists before and after it.
         """
@@ -187,7 +188,7 @@ class KeyframeStore:
 
 
 def _described(frame: Frame, found: Features | None) -> DescribedKeypoints | Features:
-    """Return the ORB features *found* by the tracker, at most 1200; else extract 500 from the image."""
+    """Return the ORB features *found* by the tracker, at most 1200, or up to 500 extracted from the image."""
     if found is None or found.kind != ORB or not (found.is_oriented and found.is_scaled):
         return describe(frame.rgb, _EXTRACTED_FEATURES)
     if len(found.pixels) <= _MAX_FEATURES:
@@ -217,7 +218,7 @@ class Tracks:
 
 
 def tracks_of(keyframes: list[Keyframe], most: int = 3000) -> Tracks:
-    """Match each keyframe with up to five before it, and return the tracks that span most keyframes.
+    """Match each keyframe with up to five earlier keyframes; return the tracks that span most keyframes.
 
     Each track is one landmark, seen by two keyframes or more; at most *most* tracks are returned.
     """
@@ -271,7 +272,7 @@ def matched(one: Keyframe, other: Keyframe) -> tuple[Rows, Rows]:
 
 
 def _has_depth(frame: Frame) -> bool:
-    """Return whether a depth image has a depth other than 0; a sample of its pixels is tried first."""
+    """Return whether the depth image of *frame* has a depth; a sample of its pixels is tried first."""
     return bool(frame.depth_m[::16, ::16].any() or frame.depth_m.any())
 
 

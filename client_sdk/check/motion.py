@@ -36,35 +36,38 @@ __all__ = [
     "nothing_to_compare",
 ]
 
-_MIN_STEP_S = 0.45  # shortest time, seconds, over which a motion is compared: shorter ones are mostly noise
+_MIN_STEP_S = 0.45  # shortest time, seconds, over which a motion is compared: over less, noise prevails
 _MAX_STEP_S = 1.0  # longest time, seconds, over which a motion is compared
 _MAX_PAIRS = 600  # approximate largest number of motions that are compared: bounds the time
-_MIN_PAIRS = 20  # fewest motions that camera and reference need in common
+_MIN_PAIRS = 20  # fewest motions during which both camera and reference have poses
 # Number of consecutive parts of a drive from whose differences standard deviations are computed (jackknife).
 _BLOCKS = 10
 _MAX_DELAY_S = 0.5  # largest delay of the stamps, in seconds, that is tried in both directions
 _DELAY_STEP_S = 0.02  # difference, in seconds, of successive delays that are tried
-_DELAY_MODEL_ERROR_S = 0.003  # standard deviation of a delay that remains in every drive, seconds
-_MIN_DELAY_S = 0.01  # smallest delay that is reported, seconds
+_DELAY_MODEL_ERROR_S = 0.003  # standard deviation of the stamps' delay that remains in every drive, seconds
+_MIN_DELAY_S = 0.01  # smallest delay of the stamps that is reported, seconds
 _MAX_DELAY_DEVIATION_S = 0.04  # largest standard deviation, in seconds, of a delay that a drive determines
 _DELAY_ERROR_SHARE = 0.1
-"""Standard deviation of a delay as a share of the interval between frames: the motion between two frames is
-not known."""
+"""Standard deviation of the stamps' delay as a share of the interval between frames: the motion between two
+frames is not known."""
 _MAX_RESIDUAL_SHARE = 0.5
-"""Largest share of the motions' squares that remains as residuals if camera and reference move alike."""
-# One model fits better than another if its sum of squared residuals is below this share of the other one's.
+"""Largest share of the motions' sum of squares that remains as residuals if camera and reference move
+alike."""
+# A rotation or mirror fits better than another if its sum of squared residuals is below this share of the
+# other sum.
 _MAX_BETTER_RATIO = 0.5
-# Images are mirrored only if the mirror leaves at most this many times the squares of the best rotation.
+# Images are mirrored only if the best mirror leaves at most this many times the sum of squared residuals of
+# the best rotation.
 _MAX_MIRROR_RATIO = 1.2
 _CERTAIN_SIGMAS = 3.0  # a difference is certain if it exceeds this many of its standard deviations
 _MAX_AXES_RESIDUAL_SHARE = 0.15
 """Axes and mirroring are checked only if the best rotation or mirror leaves at most this share of the
 motions' sum of squares."""
 _MIN_AXES_ANGLE_DEG = 20.0  # smallest rotation between the axes of reference and camera that is a fault
-# Largest rotation, degrees, from an exchange of axes at which a message names the exchanged axes.
+# Largest rotation, degrees, between the estimated axes and an exact exchange of axes that a message names.
 _MAX_NAMED_AXES_ERROR_DEG = 15.0
 _SEGMENT_M = 0.25  # distance, metres, that the reference moves in each part of a path whose scale is compared
-_SEGMENT_S = 6.0  # longest time, seconds, of a part of a path whose scale is compared: longer ones have drift
+_SEGMENT_S = 6.0  # longest duration, seconds, of a part of a path whose scale is compared: drift bounds it
 _MIN_SEGMENTS = 12  # fewest parts of a path from whose lengths the scale is computed
 MIN_ADJUSTED_KEYFRAMES = 16
 """Fewest adjusted keyframes from which the scale is computed; with fewer ones the tracked poses are used."""
@@ -73,7 +76,7 @@ _ARM_M = 0.5  # typical distance, metres, of a camera from the frame of an odome
 # prior.
 _CAMERA_ARM_M = 0.02
 _MIN_SCALE_ERROR = 0.01  # smallest relative error of the scale that is reported
-_MAX_RESIDUAL_RATIO = 4.0  # a residual above this many times the median one is an outlier
+_MAX_RESIDUAL_RATIO = 4.0  # a residual above this many times the median residual is an outlier
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +99,7 @@ class MotionReference:
     def of_truth(
         cls, path: Trajectory | None, kind: str, *, is_camera: bool = True
     ) -> MotionReference | None:
-        """Return the ground truth of a recording as a reference; None if it has fewer than two poses.
+        """Return the ground truth of a recording as a reference; None if the truth has fewer than two poses.
 
         *kind* says what the poses are: ``ground truth``, or another text for poses that are no ground truth.
         """
@@ -106,7 +109,7 @@ class MotionReference:
         return cls(path=path, name=name, is_camera=is_camera)
 
     @classmethod
-    def beside(cls, source: Path | str) -> MotionReference | None:
+    def of_folder(cls, source: Path | str) -> MotionReference | None:
         """Read ``odometry.txt`` (TUM format) in the folder of a recording; None if there is no such file.
 
         Raises:
@@ -199,10 +202,10 @@ class CameraMotion:
 
 
 def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list[Finding], list[CannotTell]]:
-    """Compare the motion of a camera with *reference*; return the faults, and those that cannot be found.
+    """Compare the motion of a camera with *reference*; return the faults, and the undetermined faults.
 
-    If a different order of the quaternions' numbers, or nothing at all, explains the motions, only that is
-    returned.
+    If only another order of the numbers in the reference's quaternions explains the motions, or if nothing
+    explains them, only this fault is returned.
     """
     stamps_s, T_world_camera, segments = motion.stamps_s, motion.T_world_camera, motion.segments
     pairs = _pairs(stamps_s, segments)
@@ -245,7 +248,7 @@ def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list
 
 
 def _explains_reordered(seen: Array, stamps_s: Array, reference: MotionReference, left: float) -> bool:
-    """Return whether the reference fits clearly better once w of its quaternions is at the other end.
+    """Return whether the reference fits clearly better if its quaternions have w first instead of last.
 
     *left* is the residual share (`_Fit.left`) of the best fit with the quaternions as they are.
     """
@@ -324,24 +327,25 @@ class _Fit:
 
     @property
     def best(self) -> Array:
-        """The squared residuals ``(m,)`` of the mirror if it fits clearly better, else of the rotation."""
+        """The squared residuals ``(m,)`` of the mirror if this fits clearly better, else of the rotation."""
         return self.mirrored if self.mirrored.sum() < _MAX_BETTER_RATIO * self.squares.sum() else self.squares
 
     @property
     def cost(self) -> float:
-        """The sum of the squared residuals of rotation or mirror, whichever is `best`."""
+        """The sum of the squared residuals of rotation or mirror, whichever `best` selects."""
         return float(self.best.sum())
 
     @property
     def left(self) -> float:
-        """The share of the motions' sum of squares that remains as residuals, 0..1 for a usable fit."""
+        """The share of the motions' sum of squares that remains as residuals; 0..1 for a usable fit."""
         return self.cost / max(self.power, 1e-12)
 
 
 def _fits(seen: Array, stamps_s: Array, reference: MotionReference) -> list[_Fit]:
-    """Return the fit at each of `_DELAYS_S`, with outliers rejected at the best of them.
+    """Return the fit of camera and reference at each of `_DELAYS_S`, with outliers of the best fit rejected.
 
-    *seen* ``(m, 6)`` are the velocities of the camera, *stamps_s* ``(m, 2)`` begin and end of each motion.
+    *seen* ``(m, 6)`` are the velocities of the camera (m/s, then rad/s); *stamps_s* ``(m, 2)`` are begin and
+    end of each motion, seconds.
     """
     measured, path = [], reference.path
     for delay_s in _DELAYS_S.tolist():
@@ -481,7 +485,7 @@ def _is_certain(one: Array, other: Array) -> bool:
 
 
 def _axes(fit: _Fit, reference: MotionReference) -> tuple[list[Finding], list[CannotTell]]:
-    """Return the finding on mirrored images or different axes, or why that cannot be found."""
+    """Return the finding on mirrored images or different axes, or why the drive does not determine it."""
     if fit.left > _MAX_AXES_RESIDUAL_SHARE:
         return [], [CannotTell(FaultKind.MIRRORED, f"the camera moves only roughly as {reference.name} says")]
     own = fit.plain if reference.is_camera else fit.squares
@@ -563,7 +567,7 @@ def _scale(
         what = kind.value.replace("_", " ")
         why = f"parts of the path differ from {reference.name}"
         if motion.scale_deviation > 0.7 * deviation / scale:
-            why = "what the calibration leaves in doubt changes the scale as well"
+            why = "the uncertainty of the calibration changes the scale as well"
         reason = f"{why}: {what} within {100 * vague:.0f} %"
         return [], [CannotTell(kind, reason, vague)] if vague > 0.05 else []
     positions = path.at(stamps_s[inside])[:, :3, 3]
@@ -588,7 +592,7 @@ def _scale(
 
 
 def _times(scale: float, deviation: float) -> str:
-    """Return by which factor *scale* a setting is wrong, as a phrase that follows "is set"."""
+    """Return the factor *scale* by which a setting is wrong as a phrase that follows the words "is set"."""
     if 0.5 < scale < 2.0:
         return (
             f"{100 * abs(scale - 1):.1f} +- {100 * deviation:.1f} % too {'large' if scale > 1 else 'small'}"
@@ -604,7 +608,7 @@ def _segments(
     Args:
         stamps_s: ``(n,)``, times of the poses.
         positions: ``(n, 3)``, positions of the reference at these times, metres.
-        segments: ``(n,)``, segments of the poses; None for one.
+        segments: ``(n,)``, numbers of the segments of the poses; None if there is one segment.
         inside: ``(n,)``, whether the reference covers these times.
     """
     pairs: list[tuple[int, int]] = []
@@ -641,7 +645,7 @@ def _solve_scale(A: Array, B: Array, rotation: Array, arm_m: float, kept: Array)
 
 
 def _imu_findings(check: RateCheck) -> list[Finding]:
-    """Return the fault that a comparison with the gyroscope found as a finding; none without a fault."""
+    """Return the fault of a comparison with the gyroscope as a finding; an empty list without a fault."""
     if not check.fault:
         return []
     kind = FaultKind.STAMP_DELAY if check.fault == "offset" else FaultKind.SWAPPED_AXES

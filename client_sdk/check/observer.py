@@ -46,7 +46,7 @@ class DriveObserver:
 
         Args:
             reference: Odometry or ground truth to compare with; may also be set later, before `finish`.
-            is_thinned: Whether frames were left out on purpose; then missing frames are no fault.
+            is_thinned: Whether frames of the recording were left out on purpose; then gaps are no fault.
         """
         self.reference = reference
         self._store = KeyframeStore()
@@ -81,9 +81,9 @@ class DriveObserver:
             self._poses.append((frame.timestamp_s, tracked.T_world_camera, tracked.segment))
 
     def add_pairs(self, fault: PairFault | None) -> None:
-        """Set the fault of the stereo rig; None if there is none.
+        """Set the fault of the stereo rig; None if the rig has no fault.
 
-        It comes from `client_sdk.rigs.stereo_pair_checks.find_fault_of_frames`.
+        The fault is found by `client_sdk.rigs.stereo_pair_checks.find_fault_of_frames`.
         """
         self._pair_fault = fault
 

@@ -24,12 +24,12 @@ _KIND = FaultKind.DISPARITY_OFFSET
 _MIN_KEYFRAMES = 12
 """Fewest adjusted keyframes with which a disparity offset is reported.  With 5 to 11 keyframes of EuRoC MH_01
 the estimate was wrong by up to five of its standard deviations."""
-_DEVIATION_INFLATION = 1.5  # factor on the standard deviation of the adjustment, which is too small
+_DEVIATION_INFLATION = 1.5  # factor on the standard deviation of the adjustment, which by itself is too small
 _MODEL_DEVIATION_PX = 0.03  # standard deviation of the disparity offset, px, that remains in every drive
 _USUAL_DEVIATION_PX = 0.033  # standard deviation of the disparity offset of a good calibration, px
 _FAULT_DEVIATION_PX = 0.5  # standard deviation of the disparity offset of a wrong calibration, px
 _MIN_OFFSET_PX = 0.1  # smallest disparity offset that is reported, px
-_MAX_BOUND_PX = 0.3  # largest bound (three standard deviations) with which a drive determines the offset, px
+_MAX_BOUND_PX = 0.3  # largest bound (three standard deviations), px, of an offset that a drive determines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,7 +38,7 @@ class PairsCheck:
 
     Attributes:
         findings: The offset of the disparities, if it is certain and matters.
-        cannot_tell: That fault, if the drive does not determine the offset.
+        cannot_tell: The fault "disparity offset", if the drive does not determine the offset.
         adjusted: The adjustments of the segments that have an offset, by number of the segment.
         scale_deviation: Relative standard deviation of the metric scale that results from the uncertainty of
             the offset.

@@ -23,37 +23,45 @@ from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
 
 __all__ = ["SceneWatch", "doubts_of_depth"]
 
-_EVERY_S = 0.38
+_MIN_SAMPLE_INTERVAL_S = 0.38
 """Shortest time, seconds, between two samples of a drive.  A sample is two frames in succession, since a
 projector may be on in every second frame only."""
-_APART_S = 1.0  # shortest time, seconds, between two images that are compared
-_LINES = 60  # number of image rows that are compared
-_ROWS = 6  # number of blocks of an image from top to bottom
-_COLUMNS = 8  # number of blocks of an image from left to right
-_DARK_LEVEL = 8  # pixels up to this grey level of 255 count as the black border of an undistorted image
+_MIN_COMPARED_INTERVAL_S = 1.0  # shortest time, seconds, between two images that are compared
+_COMPARED_ROWS = 60  # number of image rows whose pixels are compared between two images
+_BLOCK_ROWS = 6  # number of blocks into which an image is divided from top to bottom
+_BLOCK_COLUMNS = 8  # number of blocks into which an image is divided from left to right
+_MAX_BORDER_LEVEL = 8  # pixels up to this grey level of 255 count as the black border of an undistorted image
 # Smallest mean square of the second differences of a block with texture; the noise of a sensor has less.
 _MIN_TEXTURE = 150.0
-_MIN_BLOCKS = 6  # fewest blocks with texture with which two images are compared
-_MIN_MOVED_PX = 10.0  # smallest motion of the image, by its poses, between two images that are compared
-_MIN_CORRELATION = 0.6  # correlation of a block from which it is unchanged; moving ones have less than 0.1
-_MIN_IMAGES = 3  # fewest images with a pattern or with moving objects that are reported
-_WHOLE = 0.7  # share of unchanged blocks from which a pattern covers the whole image
-_PART = 0.1  # share of unchanged blocks from which a part of the image is static; good drives have up to 0.03
-_OFTEN = 0.2  # smallest share of images with a pattern over the whole image that is reported
-_MOSTLY = 0.5  # smallest share of images with a static part that is reported as moving objects
-_ALWAYS = 0.8  # share of the images in which a block must be unchanged to belong to an overlay
-# Largest ratio, as a natural logarithm, of two depths of one point; a larger one shows another surface.
-_MAX_RATIO = 0.2
-_RAY_SLOPE = 0.4  # slope from which depth is along the ray: it has 1, depth along the axis at most 0.15
-_RAY_DEVIATION = 0.1  # largest standard deviation of the slope with which a drive is classified
+_MIN_TEXTURED_BLOCKS = 6  # fewest blocks with texture with which two images are compared
+# Smallest motion of the image, pixels, that the poses of two compared images predict.
+_MIN_MOVED_PX = 10.0
+# Smallest correlation of a block of two images that counts as unchanged; blocks that moved have less than
+# 0.1.
+_MIN_CORRELATION = 0.6
+_MIN_IMAGES = 3  # fewest images with a static pattern or with moving objects that are reported
+_MIN_WHOLE_SHARE = 0.7  # smallest share of unchanged blocks at which a static pattern covers the whole image
+# Smallest share of unchanged blocks at which a part of the image is static; good drives have up to 0.03.
+_MIN_PART_SHARE = 0.1
+# Smallest share of the images that a static pattern covers wholly from which the pattern is reported.
+_MIN_PATTERN_IMAGE_SHARE = 0.2
+# Smallest share of the images with a static part from which moving objects are reported.
+_MIN_STATIC_IMAGE_SHARE = 0.5
+_MIN_OVERLAY_IMAGE_SHARE = 0.8  # share of the images in which a block of an overlay must be unchanged
+# Largest natural logarithm of the ratio of two depths of one point; a larger ratio shows another surface.
+_MAX_LOG_DEPTH_RATIO = 0.2
+# Smallest slope of log depth over log ray length at which depth is measured along the ray: such depth has the
+# slope 1, depth along the optical axis at most 0.15.
+_MIN_RAY_SLOPE = 0.4
+_MAX_RAY_SLOPE_DEVIATION = 0.1  # largest standard deviation of that slope with which a drive is classified
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _View:
-    """A sampled image of a drive.
+    """A sampled image of a drive, divided into 48 blocks.
 
-    ``edges`` ``(48, n)`` are the second differences along image rows of its 48 blocks, ``texture`` ``(48,)``
-    their mean squares, and ``T_world_camera`` the tracked pose.
+    ``edges`` ``(48, n)`` are the second differences of grey levels along image rows in each block,
+    ``texture`` ``(48,)`` their mean squares, and ``T_world_camera`` ``(4, 4)`` is the tracked pose, metres.
     """
 
     stamp_s: float
@@ -63,7 +71,7 @@ class _View:
 
 
 class SceneWatch:
-    """Find blocks of the image that are unchanged while the camera moves; takes all frames in order."""
+    """Find blocks of the image that are unchanged while the camera moves, from the frames in order."""
 
     def __init__(self) -> None:
         self._views: deque[_View] = deque()
@@ -74,7 +82,7 @@ class SceneWatch:
         self._still: list[npt.NDArray[np.bool_]] = []
 
     def add(self, frame: Frame, tracked: TrackedFrame) -> None:
-        """Add the next frame; without a pose, it counts as taken from the last known pose."""
+        """Add the next frame; a frame without a pose counts as taken from the last known pose."""
         if tracked.T_world_camera is not None:
             self._T_world_camera = tracked.T_world_camera
         if self._T_world_camera is None or not self._is_due(frame.timestamp_s):
@@ -86,9 +94,9 @@ class SceneWatch:
             stamp_s=frame.timestamp_s, edges=edges, texture=np.square(edges).mean(axis=1),
             T_world_camera=self._T_world_camera,
         )  # fmt: skip
-        while len(self._views) > 2 and view.stamp_s - self._views[2].stamp_s >= _APART_S:
+        while len(self._views) > 2 and view.stamp_s - self._views[2].stamp_s >= _MIN_COMPARED_INTERVAL_S:
             self._views.popleft()
-        before = [each for each in self._views if view.stamp_s - each.stamp_s >= _APART_S]
+        before = [each for each in self._views if view.stamp_s - each.stamp_s >= _MIN_COMPARED_INTERVAL_S]
         depth_m = _median_depth(tracked) if before else math.inf
         moved = [each for each in before if _moved_px(each, view, frame.camera, depth_m) >= _MIN_MOVED_PX]
         if moved:
@@ -96,7 +104,7 @@ class SceneWatch:
         self._views.append(view)
 
     def _is_due(self, stamp_s: float) -> bool:
-        is_first = stamp_s - self._began_s >= _EVERY_S
+        is_first = stamp_s - self._began_s >= _MIN_SAMPLE_INTERVAL_S
         is_due, self._is_second = is_first or self._is_second, is_first
         if is_first:
             self._began_s = stamp_s
@@ -110,7 +118,7 @@ class SceneWatch:
             textured.append(has_texture)
             still.append(has_texture & (likeness > _MIN_CORRELATION * np.sqrt(each.texture * view.texture)))
         row = int(np.argmax([each.sum() for each in still]))
-        if textured[row].sum() >= _MIN_BLOCKS:
+        if textured[row].sum() >= _MIN_TEXTURED_BLOCKS:
             self._textured.append(textured[row])
             self._still.append(still[row])
 
@@ -120,17 +128,20 @@ class SceneWatch:
             return ()
         textured, still = np.array(self._textured), np.array(self._still)
         shares = still.sum(axis=1) / textured.sum(axis=1)
-        is_whole, is_part = shares >= _WHOLE, shares >= _PART
-        always = still.sum(axis=0) > _ALWAYS * np.maximum(_MIN_IMAGES, textured.sum(axis=0))
+        is_whole, is_part = shares >= _MIN_WHOLE_SHARE, shares >= _MIN_PART_SHARE
+        always = still.sum(axis=0) > _MIN_OVERLAY_IMAGE_SHARE * np.maximum(_MIN_IMAGES, textured.sum(axis=0))
         percent = f"{100 * np.median(shares[is_part]) if is_part.any() else 0:.0f} % of the image"
         seen = f"in {np.count_nonzero(is_part)} of {len(shares)} images"
-        if is_whole.sum() >= max(_MIN_IMAGES, _OFTEN * len(shares)) or always.mean() >= _PART:
+        if (
+            is_whole.sum() >= max(_MIN_IMAGES, _MIN_PATTERN_IMAGE_SHARE * len(shares))
+            or always.mean() >= _MIN_PART_SHARE
+        ):
             sentence = (
                 f"{percent} is unchanged a second later {seen}, though the pose moves: a pattern lies over it"
             )
             hint = "switch the projector off, or keep overlays and parts of the robot out of the image"
             return (Doubt(name=DoubtName.STATIC_PATTERN, sentence=sentence, hint=hint),)
-        if is_part.sum() >= max(_MIN_IMAGES, _MOSTLY * len(shares)):
+        if is_part.sum() >= max(_MIN_IMAGES, _MIN_STATIC_IMAGE_SHARE * len(shares)):
             sentence = (
                 f"{percent} is stationary {seen}, though the pose moves: something large moves in the view"
             )
@@ -145,15 +156,17 @@ def _edges(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32] | None:
     None if the image has fewer than 60 rows or 64 columns.  Differences at dark pixels are 0.
     """
     height, width = rgb.shape[:2]
-    if height < _LINES or width < 8 * _COLUMNS:
+    if height < _COMPARED_ROWS or width < 8 * _BLOCK_COLUMNS:
         return None
-    lines = rgb[:: height // _LINES, :, 1][:_LINES].astype(np.int16)
-    lines = lines[:, : (width - 4) // _COLUMNS * _COLUMNS + 4]
+    lines = rgb[:: height // _COMPARED_ROWS, :, 1][:_COMPARED_ROWS].astype(np.int16)
+    lines = lines[:, : (width - 4) // _BLOCK_COLUMNS * _BLOCK_COLUMNS + 4]
     left, middle, right = lines[:, :-4], lines[:, 2:-2], lines[:, 4:]
-    is_seen = np.minimum(np.minimum(left, middle), right) > _DARK_LEVEL
+    is_seen = np.minimum(np.minimum(left, middle), right) > _MAX_BORDER_LEVEL
     edges = np.where(is_seen, 2 * middle - left - right, 0).astype(np.float32)
-    blocks = edges.reshape(_ROWS, _LINES // _ROWS, _COLUMNS, -1).transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(blocks).reshape(_ROWS * _COLUMNS, -1)
+    blocks = edges.reshape(_BLOCK_ROWS, _COMPARED_ROWS // _BLOCK_ROWS, _BLOCK_COLUMNS, -1).transpose(
+        0, 2, 1, 3
+    )
+    return np.ascontiguousarray(blocks).reshape(_BLOCK_ROWS * _BLOCK_COLUMNS, -1)
 
 
 def _median_depth(tracked: TrackedFrame) -> float:
@@ -188,7 +201,7 @@ def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
         spread = 1.4826 * float(np.median(np.abs(errors))) + 1e-6
         weights = 1.0 / (1.0 + np.square(errors / (2.0 * spread)))
     deviation = spread / max(1e-9, float(np.sqrt((weights * rays * rays).sum())))
-    if deviation > _RAY_DEVIATION or slope < _RAY_SLOPE:
+    if deviation > _MAX_RAY_SLOPE_DEVIATION or slope < _MIN_RAY_SLOPE:
         return ()
     mirrored = [_all_ratios(keyframes, flip) for flip in range(1, len(FLIPS))]
     if any(1.4826 * float(np.median(np.abs(each[1]))) < spread for each in mirrored if each is not None):
@@ -215,10 +228,11 @@ def _all_ratios(keyframes: Sequence[Keyframe], flip: int) -> tuple[Array, Array]
 
 
 def _ratios(before: Keyframe, keyframe: Keyframe, flip: int) -> tuple[Array, Array] | None:
-    """Return for points seen by two keyframes the logarithms ``(n,)`` of two ratios.
+    """Return ratios of ray lengths and of depths for points seen by two keyframes, as natural logarithms.
 
-    The first is the length of the ray to the point in *keyframe* over that in *before*; the second the depth
-    in *keyframe* over the depth expected from *before*, minus its median.  None without two poses or with
+    Both results have the shape ``(n,)``.  The ratio of ray lengths is the length of the ray to the point in
+    *keyframe* over that in *before*.  The ratio of depths is the depth in *keyframe* over the depth expected
+    from *before*; the median of its logarithm is subtracted.  None without two poses or with
     fewer than 12 points.
     """
     if before.T_world_camera is None or keyframe.T_world_camera is None:
@@ -231,7 +245,7 @@ def _ratios(before: Keyframe, keyframe: Keyframe, flip: int) -> tuple[Array, Arr
     points = transform(inverse(keyframe.T_world_camera) @ before.T_world_camera, points)
     depths = np.log(new_m / np.maximum(points[:, 2], 1e-3))
     rays = _log_rays(keyframe, other) - _log_rays(before, one)
-    is_same = np.abs(depths) < _MAX_RATIO
+    is_same = np.abs(depths) < _MAX_LOG_DEPTH_RATIO
     if np.count_nonzero(is_same) < 12:
         return None
     return rays[is_same], depths[is_same] - float(np.median(depths[is_same]))

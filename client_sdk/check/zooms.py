@@ -23,18 +23,22 @@ _MIN_JUMP = 0.03  # smallest difference of two successive zooms that is a jump
 _MIN_CHANGE = 0.02  # smallest change of the zoom over a drive that is reported
 _CERTAIN_SIGMAS = 3.0  # a change of the zoom is certain if it exceeds this many standard deviations
 _JUMP_SIGMAS = 6.0  # a jump of the zoom exceeds this many standard deviations of its step
-_HINT_SIGMAS = 1.5  # a change of more than this many standard deviations is passed on as a hint
-_MAX_JUMP_DIFFERENCE = 0.2  # largest difference of a jump from the mean jump of two cameras, as a share of it
-_MODEL_DEVIATION = 0.005  # standard deviation of a zoom that remains in every drive
+_HINT_SIGMAS = 1.5  # a change of the zoom of more than this many standard deviations is returned as a hint
+# Largest difference of a jump from the mean jump between two cameras, as a share of the mean jump.
+_MAX_JUMP_DIFFERENCE = 0.2
+_MODEL_DEVIATION = 0.005  # standard deviation of a zoom that remains in every drive, whatever its length
 _DEVIATION_INFLATION = 1.5  # factor on the standard deviations of the adjustment, which are too small
-_PARTS = 5  # number of parts of a drive whose rates of change are compared, and fewest keyframes for it
-# The parts of a drive disagree if their deviation exceeds this many times that of the adjustment.
+# Number of parts of a drive whose rates of change of the zoom are compared, and fewest keyframes for this.
+_PARTS = 5
+# The parts of a drive disagree if the standard deviation between them exceeds this many times the standard
+# deviation of the adjustment.
 _DISAGREEMENT_RATIO = 2.0
 _QUANTILE = 0.3
-"""Quantile of the absolute steps from which their noise is computed.  It is below the median, so that up to
-half of the steps may be jumps."""
+"""Quantile of the absolute steps between successive zooms from which their noise is computed.  It is below
+the median, so that up to half of the steps may be jumps."""
 _NORMAL_QUANTILE = 0.385  # 0.3 quantile of the absolute values of a normal distribution with deviation 1
-_MAX_BOUND = 0.08  # largest bound (three standard deviations) with which a drive determines the change
+# Largest bound (three standard deviations) of the change of the zoom that a drive determines.
+_MAX_BOUND = 0.08
 
 Rows = npt.NDArray[np.int64]
 
@@ -53,7 +57,9 @@ class ZoomCheck:
 
 
 def check_zooms(zoomed: Calibrated, times_s: Array, common: Calibrated) -> ZoomCheck:
-    """Find out whether the focal length jumps or moves during a drive; no result with fewer than 5 keyframes.
+    """Find out whether the focal length jumps or moves during a drive.
+
+    Fewer than 5 keyframes give an empty result.
 
     Args:
         zoomed: The drive, adjusted with a focal length for each keyframe.
@@ -89,8 +95,8 @@ def _check_jumps(
 ) -> ZoomCheck:
     """Return the finding of two cameras if all *jumps* have one size and alternating signs.
 
-    Else return that the drive does not determine the cause.  *jumps* are indices of *steps* ``(k - 1,)``,
-    *noise* the standard deviations of the steps.
+    Otherwise return that the drive does not determine the cause of the jumps.  *jumps* are indices of *steps*
+    ``(k - 1,)``, *noise* the standard deviations of the steps.
     """
     sizes, n = np.abs(steps[jumps]), len(jumps)
     size = float(np.average(sizes, weights=1.0 / noise[jumps] ** 2))
@@ -126,7 +132,7 @@ def _check_jumps(
 def _check_steady_change(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated) -> ZoomCheck:
     """Return the finding of a lens that focuses if all parts of the drive show the same change.
 
-    Else return a hint of the change, and a bound if the drive does not determine it.
+    Otherwise return a hint of the change, and a bound of the change if the drive does not determine it.
     """
     span_s = float(np.ptp(times_s))
     rates = _rates(zooms, times_s)
@@ -153,7 +159,7 @@ def _check_steady_change(zooms: Array, times_s: Array, common: Calibrated, zoome
         return ZoomCheck(hint=hint)
     low, high = float(rates.min()) * span_s, float(rates.max()) * span_s
     errors = "of depth or of the lens" if common.has_metric_scale else "of the lens or its distortion"
-    reason = f"{len(zooms)} views do not tell more"
+    reason = f"{len(zooms)} views do not determine more"
     if between > _DISAGREEMENT_RATIO * own:
         reason = (
             f"parts of the drive say that the focal length changes by {low:+.0%} to {high:+.0%}, as by "

@@ -58,7 +58,7 @@ def test_the_boxes_show_what_aws_knows_and_say_what_it_does_not() -> None:
     assert [each["age_s"] for each in told["servers"]] == [90.0, None]
     assert (told["robots"], told["requests"], told["percentiles"], told["bytes_in"]) == (7, 10.0, {}, None)
     assert (told["tls"], told["balancer"], told["url"]) == (True, True, "lb.example")
-    assert told["unknown"][0] == "1 of 2 servers did not tell their robots"
+    assert told["unknown"][0] == "1 of 2 servers did not report their robots"
     assert json.loads(json.dumps(told)) == told
 
 

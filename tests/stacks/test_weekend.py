@@ -166,7 +166,7 @@ def test_a_resume_by_hand_makes_up_for_the_entries_that_were_due_meanwhile(produ
     park(production)
     world = StepContext(
         account=production.account, settings=production.settings, tools=Formation("", Killer()),
-        tell=production.told.append, now=lambda: MONDAY + timedelta(hours=2),
+        report_progress=production.told.append, now=lambda: MONDAY + timedelta(hours=2),
     )  # fmt: skip
 
     carry_out([Step("fill"), Step("alert"), Step("forget")], world)

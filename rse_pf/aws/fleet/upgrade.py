@@ -203,7 +203,7 @@ def upgrade(
     account: Account,
     settings: PlatformSettings,
     *,
-    tell: Callable[[str], None],
+    report_progress: Callable[[str], None],
     sleep: Callable[[float], None],
     now: Callable[[], datetime],
 ) -> Upgraded:
@@ -212,7 +212,7 @@ def upgrade(
     Args:
         account: AWS account of the deployment.
         settings: Settings of the platform.
-        tell: Called with each line of progress.
+        report_progress: Called with each line of progress.
         sleep: Waits between two reads of the state; after a KeyboardInterrupt AWS continues by itself.
         now: Returns the time in UTC.
 
@@ -226,12 +226,12 @@ def upgrade(
     if step in (UpgradeStep.REFRESH, UpgradeStep.FOLLOW):
         begun = now()
         if step is UpgradeStep.FOLLOW and release.refresh is not None:
-            tell("a refresh runs already; following it")
+            report_progress("a refresh runs already; following it")
             begun = release.refresh.get("StartTime", begun)
             version = _version_of(release.refresh) or version
             identity = release.refresh["InstanceRefreshId"]
         elif release.raw_group["Instances"]:
-            identity = _start_refresh(account, settings, release, tell)
+            identity = _start_refresh(account, settings, release, report_progress)
         else:
             account.change(
                 "autoscaling", "update_auto_scaling_group",
@@ -239,19 +239,19 @@ def upgrade(
                 **with_version(release.raw_group, version),
             )  # fmt: skip
         if release.raw_group["Instances"]:
-            ended = _follow_refresh(account, settings, identity, begun, tell, sleep)
+            ended = _follow_refresh(account, settings, identity, begun, report_progress, sleep)
             if ended.reason:
                 return ended
             replaced = True
         step = UpgradeStep.RECORD
     if step is UpgradeStep.RECORD:
         _record_version(account, settings, version, sleep)
-        tell(f"the stack names version {version}")
+        report_progress(f"the stack names version {version}")
     return Upgraded(version=version, replaced=replaced)
 
 
 def _start_refresh(
-    account: Account, settings: PlatformSettings, release: Release, tell: Callable[[str], None]
+    account: Account, settings: PlatformSettings, release: Release, report_progress: Callable[[str], None]
 ) -> str:
     """Start an instance refresh to the newest version, watched by the alarms of `WATCHED`; return its id."""
     names = ResourceNames(settings.cloud.name)
@@ -260,8 +260,8 @@ def _start_refresh(
     firing = sorted(watched_alarms[alarm["AlarmName"]] for alarm in rows if alarm["StateValue"] == "ALARM")
     quiet = sorted(alarm["AlarmName"] for alarm in rows if alarm["StateValue"] != "ALARM")
     for name in firing:
-        tell(f"alarm {name} fires already, so it does not end this upgrade")
-    tell(f"replacing servers: version {release.group} by {release.newest}")
+        report_progress(f"alarm {name} fires already, so it does not end this upgrade")
+    report_progress(f"replacing servers: version {release.group} by {release.newest}")
     started = account.change(
         "autoscaling", "start_instance_refresh", AutoScalingGroupName=names.group, Strategy="Rolling",
         DesiredConfiguration=with_version(release.raw_group, release.newest),
@@ -275,7 +275,7 @@ def _follow_refresh(
     settings: PlatformSettings,
     identity: str,
     begun: datetime,
-    tell: Callable[[str], None],
+    report_progress: Callable[[str], None],
     sleep: Callable[[float], None],
 ) -> Upgraded:
     """Report the progress until the refresh *identity* has ended, and return its result.
@@ -294,7 +294,7 @@ def _follow_refresh(
         state = state_of_refresh(refresh)
         line = f"{state.value}: {refresh.get('PercentageComplete', 0)} %"
         if line != last_line:
-            tell(line)
+            report_progress(line)
             last_line = line
         if state is State.DONE:
             return Upgraded(version=_version_of(refresh), replaced=True)
@@ -311,7 +311,7 @@ def _follow_refresh(
             if failed is not None:
                 cause = str(failed.get("StatusMessage") or failed["Description"])
                 console = _read_console(account, failed)
-                tell(f"a new server did not become ready: {cause}")
+                report_progress(f"a new server did not become ready: {cause}")
                 account.find("autoscaling", "rollback_instance_refresh", AutoScalingGroupName=names.group)
         sleep(POLL_S)
 

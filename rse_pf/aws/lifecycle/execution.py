@@ -46,13 +46,14 @@ _HEALTHY_TIMEOUT_S = 600.0
 class StepContext:
     """The account, settings, tools and clocks that steps use.
 
-    ``tell`` shows a line of progress to the operator; ``clock`` returns monotonic seconds, ``now`` UTC.
+    ``report_progress`` shows a line of progress to the operator; ``clock`` returns monotonic seconds, ``now``
+    UTC.
     """
 
     account: Account
     settings: PlatformSettings
     tools: CdkTools
-    tell: Callable[[str], None]
+    report_progress: Callable[[str], None]
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
     now: Callable[[], datetime] = lambda: datetime.now(timezone.utc)
@@ -73,7 +74,7 @@ def carry_out(steps: Iterable[Step], world: StepContext) -> None:
         StoreError: AWS does not answer.
     """
     for step in steps:
-        world.tell(str(step))
+        world.report_progress(str(step))
         _EFFECTS[step.action](step, world)
 
 
@@ -213,7 +214,7 @@ def _sweep(step: Step, world: StepContext) -> None:
 
 def _erase(step: Step, world: StepContext) -> None:
     for refused in erase_data(world.account, world.names, audit_days=world.settings.cloud.audit_days):
-        world.tell(refused)
+        world.report_progress(refused)
 
 
 _EFFECTS: dict[Action, Callable[[Step, StepContext], None]] = {

@@ -79,7 +79,9 @@ def make_tools(account: Account, settings: PlatformSettings, request: ChangeRequ
 
 def open_world(account: Account, settings: PlatformSettings, tools: CdkTools) -> StepContext:
     """Return the context of steps: account, settings, tools, and the output of their progress."""
-    return StepContext(account=account, settings=settings, tools=tools, tell=lambda text: show(f"  {text}"))
+    return StepContext(
+        account=account, settings=settings, tools=tools, report_progress=lambda text: show(f"  {text}")
+    )
 
 
 def show_steps(steps: Sequence[Step]) -> None:

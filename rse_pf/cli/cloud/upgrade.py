@@ -23,7 +23,7 @@ def upgrade_servers(request: NoOptions, settings: PlatformSettings) -> int:
 
     try:
         ended = upgrade(
-            open_account(settings.cloud.region), settings, tell=lambda line: show(f"  {line}"),
+            open_account(settings.cloud.region), settings, report_progress=lambda line: show(f"  {line}"),
             sleep=time.sleep, now=lambda: datetime.now(timezone.utc),
         )  # fmt: skip
     except KeyboardInterrupt:

@@ -128,7 +128,7 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
     odometries = [Path(scale_file)] if kind == "odometry" else []
     if request.check:
         try:
-            reference = MotionReference.beside(request.source)
+            reference = MotionReference.of_folder(request.source)
             if reference is not None:
                 odometries.append(Path(request.source) / "odometry.txt")
         except UsageError as error:

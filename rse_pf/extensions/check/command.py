@@ -205,7 +205,7 @@ def _reference(request: CheckDriveRequest, truth: MotionReference | None) -> Mot
 
     if request.odometry is not None:
         return MotionReference.of_file(request.odometry)
-    return truth or MotionReference.beside(request.source)
+    return truth or MotionReference.of_folder(request.source)
 
 
 def _watched(

@@ -16,7 +16,8 @@ FIRST_PAUSE_S = 0.02  # pause (s) between messages to a new client; it is over a
 NO_PAUSE_S = 0.005  # a pause that has shrunk below this (s) ends: messages are sent without waiting
 SHRINKING = 0.8  # factor of the pause after each prompt pong: a pause of 0.5 s is over after about 2 s
 LATE_SHARE = 0.5  # the pause becomes at least this fraction of a late pong's delay, in which the client reads
-SLACK_S = 0.1  # a pong is late if it takes longer than this (s) plus twice the shortest round trip
+# A pong is late if it takes longer than this time (s) plus twice the shortest round trip.
+PONG_TOLERANCE_S = 0.1
 
 
 class Pacing:
@@ -37,7 +38,7 @@ class Pacing:
     @property
     def late_s(self) -> float:
         """The time after a ping, in seconds, from which its pong is late: 0.2 s before the first pong."""
-        return SLACK_S + (2 * self._best_s if self._best_s < float("inf") else SLACK_S)
+        return PONG_TOLERANCE_S + (2 * self._best_s if self._best_s < float("inf") else PONG_TOLERANCE_S)
 
     def wait_s(self, now: float) -> float:
         """Return the seconds until the ping before the next message may be sent.

@@ -7,8 +7,9 @@
 
 Both refusals are extended to other robots only if sandboxes of several robots crashed:
 
-- to all robots of a tenant if sandboxes of at least `ROBOTS_OF_A_TENANT` robots of this tenant crashed;
-- to all robots if sandboxes of at least `ROBOTS_OF_A_TENANT` robots crashed, and at least `ROBOTS_OF_OTHERS`
+- to all robots of a tenant if sandboxes of at least `MIN_ROBOTS_OF_TENANT` robots of this tenant crashed;
+- to all robots if sandboxes of at least `MIN_ROBOTS_OF_TENANT` robots crashed, and at least
+  `MIN_ROBOTS_OF_OTHER_TENANTS`
   of these robots do not belong to the tenant with the most such robots.  A single tenant can therefore not
   make a service unavailable to other tenants.
 
@@ -34,10 +35,10 @@ from rse_pf.errors import Poison, WorkerLost
 from rse_pf.identity import RobotId
 
 __all__ = [
+    "MIN_ROBOTS_OF_OTHER_TENANTS",
+    "MIN_ROBOTS_OF_TENANT",
     "OPEN_S",
     "POISON_S",
-    "ROBOTS_OF_A_TENANT",
-    "ROBOTS_OF_OTHERS",
     "WINDOW_S",
     "Block",
     "CircuitBreaker",
@@ -47,8 +48,10 @@ WINDOW_S = 30.0  # seconds within which ``services.breaker_crashes`` crashes or 
 OPEN_S = 60.0  # seconds for which an open circuit breaker refuses a service; then the service is tried again
 POISON_CRASHES = 2  # crashes that make a request poison: after a crash, the request is retried once
 POISON_S = 600.0  # seconds for which a request is refused as poison, from the first of the counted crashes on
-ROBOTS_OF_A_TENANT = 3  # robots with crashed sandboxes from which on all robots of their tenant are refused
-ROBOTS_OF_OTHERS = 2  # robots with crashes outside the most affected tenant, before all robots are refused
+# Fewest robots of one tenant with crashed sandboxes at which all robots of this tenant are refused.
+MIN_ROBOTS_OF_TENANT = 3
+# Fewest robots with crashed sandboxes outside the most affected tenant at which all robots are refused.
+MIN_ROBOTS_OF_OTHER_TENANTS = 2
 _MAX_REQUESTS = 10_000  # most requests whose crashes are stored; the one that crashed longest ago is removed
 _MAX_ENDS_OF_REQUEST = 32  # most crashes that are stored for one request; the oldest is removed first
 _MAX_ENDS_OF_SERVICE = 1024  # most crashes and overruns that are stored for one service; oldest removed first
@@ -270,10 +273,10 @@ def _is_wide_enough(scope: Scope, robots: set[RobotId]) -> bool:
     """Return whether crashes at *robots* justify a refusal to all robots of *scope*."""
     if isinstance(scope, RobotId):
         return True
-    if len(robots) < ROBOTS_OF_A_TENANT:
+    if len(robots) < MIN_ROBOTS_OF_TENANT:
         return False
     of_the_largest_tenant = max(Counter(robot.tenant for robot in robots).values())
-    return scope is not None or len(robots) - of_the_largest_tenant >= ROBOTS_OF_OTHERS
+    return scope is not None or len(robots) - of_the_largest_tenant >= MIN_ROBOTS_OF_OTHER_TENANTS
 
 
 def _scopes_of(robot: RobotId) -> tuple[Scope, ...]:

@@ -188,7 +188,9 @@ class FakeClient:
 
 def run(aws: FakeAws, settings: PlatformSettings = SETTINGS) -> tuple[Any, list[str]]:
     told: list[str] = []
-    ended = upgrade(aws.account(), settings, tell=told.append, sleep=aws.sleep, now=lambda: aws.now)
+    ended = upgrade(
+        aws.account(), settings, report_progress=told.append, sleep=aws.sleep, now=lambda: aws.now
+    )
     return ended, told
 
 

@@ -51,7 +51,7 @@ def run(region: str, plan: Plan, killer: Killer) -> Account:
         account=account,
         settings=SETTINGS,
         tools=Formation(region, killer),
-        tell=lambda text: None,
+        report_progress=lambda text: None,
         sleep=sleep,
     )
     carry_out(plan(read_deployment(account, SETTINGS)), world)
@@ -149,7 +149,7 @@ def test_locked_audit_logs_stay_and_are_reported_with_their_date(region: str) ->
     told: list[str] = []
     account = account_of(region, Killer())
     world = StepContext(
-        account=account, settings=SETTINGS, tools=Formation(region, Killer()), tell=told.append,
+        account=account, settings=SETTINGS, tools=Formation(region, Killer()), report_progress=told.append,
         sleep=lambda duration_s: None,
     )  # fmt: skip
 

@@ -50,13 +50,13 @@ def test_one_pass_decompresses_a_bounded_multiple_of_the_bag(
     size_bytes = path.stat().st_size
     with open_bag_file(path) as file:
         monkeypatch.setattr(decompression, "_FREE_BYTES", 5 << 20)
-        monkeypatch.setattr(decompression, "_RATIO", 1)
+        monkeypatch.setattr(decompression, "_EXTRA_BYTES_PER_BAG_BYTE", 1)
         for _ in range(3):  # each pass begins anew
             file._reader.current_chunk = (-1, io.BytesIO())
             assert len(list(file.messages([TOPIC]))) == 1
         monkeypatch.setattr(decompression, "_FREE_BYTES", (4 << 20) - size_bytes)
         file._reader.current_chunk = (-1, io.BytesIO())
-        with pytest.raises(BrokenMessage, match="decompresses to far more than it has bytes"):
+        with pytest.raises(BrokenMessage, match="decompresses to far more bytes than its file has"):
             list(file.messages([TOPIC]))
 
 
@@ -74,7 +74,7 @@ def test_a_compressed_file_fills_no_disk(tmp_path: Path, monkeypatch: pytest.Mon
     with open_bag_file(path) as file:
         assert len(list(file.messages([TOPIC]))) == 1
     monkeypatch.setattr(decompression, "_FREE_BYTES", LIMIT_BYTES)
-    monkeypatch.setattr(decompression, "_RATIO", 1)
+    monkeypatch.setattr(decompression, "_EXTRA_BYTES_PER_BAG_BYTE", 1)
 
-    with pytest.raises(UsageError, match="decompresses to far more than it has bytes"):
+    with pytest.raises(UsageError, match="decompresses to far more bytes than its file has"):
         open_bag_file(path)

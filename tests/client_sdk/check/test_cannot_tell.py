@@ -1,4 +1,5 @@
-"""Tests of what a drive cannot tell: the reason is true, since a drive without that lack can tell it."""
+"""Tests of undetermined faults: the stated reason is true, since a drive without that lack determines
+them."""
 
 from __future__ import annotations
 
@@ -43,8 +44,8 @@ def untold(made: Made) -> dict[FaultKind, str]:
         (Made(seed=68, size=8.0), OFFSET, "of the depth of what it sees only", {"size": 1.0}),
         (Made(seed=69, moves_m=STILL), OFFSET, "moves by 0.", {"moves_m": MOVING_M}),
         (Made(seed=70, moves_m=STILL, has_depth=False), FOCAL, "moves by 0.0%", {"moves_m": MOVING_M}),
-        (Made(seed=71, moves_m=STILL, has_depth=False), MOVING, "views do not tell", {"moves_m": MOVING_M}),
-        (Made(seed=72, speed=0.05), OFFSET, "of the depth of what it sees only", {"speed": 1.0}),
+        (Made(seed=71, moves_m=STILL, has_depth=False), MOVING, "views do not determine", {"moves_m":
+        MOVING_M}), (Made(seed=72, speed=0.05), OFFSET, "of the depth of what it sees only", {"speed": 1.0}),
         (
             Made(seed=73, turn=0.0, roll=0.0, moves_m=STILL),
             PRINCIPAL, "neither moves nor turns", {"moves_m": MOVING_M, "turn": 0.5, "roll": 0.3},

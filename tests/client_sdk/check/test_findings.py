@@ -68,7 +68,7 @@ def test_a_report_without_findings_names_what_the_drive_cannot_tell() -> None:
     report = CheckReport(cannot_tell=(untold,), frames=30)
 
     assert check_lines(report.to_dict()) == [
-        "check: nothing wrong found in 30 frames; this drive cannot tell focal_length"
+        "check: nothing wrong found in 30 frames; this drive does not determine focal_length"
     ]
     assert report.to_dict()["cannot_tell"][0]["within"] == 0.06
 

@@ -101,7 +101,18 @@ def test_a_camera_that_stands_still_repeats_nothing() -> None:
     assert FaultKind.REPEATED not in found(frames)
 
 
-def test_missing_frames_are_counted_beside_jitter_of_a_clock() -> None:
+def test_overexposed_frames_of_one_brightness_are_not_repeated() -> None:
+    shown = images()
+    white = np.full_like(shown[0], 255)
+    statistics = FrameStatistics()
+    for row, image in enumerate([*shown[:20], *[white] * 8, *shown[20:40], *[white] * 15, *shown[40:]]):
+        statistics.add(row / 10.0, image)
+
+    assert not statistics.repeated().any()
+    assert statistics.frozen() == ()
+
+
+def test_missing_frames_are_counted_despite_jitter_of_a_clock() -> None:
     rng = np.random.default_rng(5)
     rows = [row for row in range(FRAMES + 20) if row % 4 != 2][:FRAMES]
     stamps = np.array(rows) / 10.0 + rng.normal(0.0, 0.003, FRAMES)

@@ -115,7 +115,7 @@ def test_a_baseline_is_not_told_where_an_offset_could_be_the_cause() -> None:
 
     assert kinds(report) == set()
     untold = next(each for each in report.cannot_tell if each.kind is FaultKind.BASELINE)
-    assert "calibration leaves in doubt" in untold.reason
+    assert "uncertainty of the calibration" in untold.reason
 
 
 def test_a_wrong_lens_leaves_no_word_about_disparities(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,7 @@ def test_three_robots_in_the_red_kitchen_end_in_one_map_within_the_limits(tmp_pa
     assert merged["joined"] == ["robot-1", "robot-2", "robot-3"]
     assert merged["ate_cm"] <= 4.5
     assert all(each["cm"] <= 7.0 and each["deg"] <= 2.5 for each in merged["origins"])
-    assert f"{merged['links_between_robots']} links between them" in said
+    assert f"{merged['loop_closures_between_robots']} loop closures between robots" in said
     assert len(read_ply(out / "merged.ply")[0]) == merged["points"] > 100_000
     paths = [read_trajectory(out / name / "merged_trajectory.txt") for name in merged["joined"]]
     assert sum(len(path) for path in paths) == merged["frames"] == 250

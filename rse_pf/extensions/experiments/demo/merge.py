@@ -86,7 +86,9 @@ def write_merged(
 def _draw(path: Path, robots: Sequence[JoinedRobot], merged: MapVersion, section: dict[str, Any]) -> None:
     subject = f"{len(robots)} robots" if len(robots) > 1 else "1 robot"
     caption = f"{subject} in one map: {section['keyframes']} keyframes"
-    caption += f", {section['links_between_robots']} links" if len(robots) > 1 else ""
+    caption += (
+        f", {section['loop_closures_between_robots']} loop closures between robots" if len(robots) > 1 else ""
+    )
     if section["ate_cm"] is not None:
         caption += f", ATE {section['ate_cm']:.1f} cm"
     if section["not_joined"]:

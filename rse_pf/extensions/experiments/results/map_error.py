@@ -116,7 +116,7 @@ def merge_section(
             {"robots": [names[row] for row in refusal.maps], "reason": refusal.reason, "count": refusal.count}
             for refusal in reply.refused
         ],
-        "links_between_robots": reply.merges,
+        "loop_closures_between_robots": reply.merges,
         "loops": reply.loops,
         "keyframes": len(merged.keyframes),
         "points": len(merged.points),
@@ -133,10 +133,10 @@ def merged_lines(section: Mapping[str, Any]) -> str:
     """
     joined = section["joined"]
     what = (
-        f"{counted(section['links_between_robots'], 'link')} between them and "
-        f"{counted(section['loops'], 'loop')}"
+        f"{counted(section['loop_closures_between_robots'], 'loop closure')} between robots "
+        f"and {section['loops']} within robots"
         if len(joined) > 1
-        else f"{counted(section['loops'], 'loop')} closed"
+        else counted(section["loops"], "loop closure")
     )
     lines = [f"merged {', '.join(joined)}: {counted(section['keyframes'], 'keyframe')}, {what}"]
     if section["ate_cm"] is not None:
@@ -157,7 +157,7 @@ def merged_lines(section: Mapping[str, Any]) -> str:
             if reasons.total() == 1
             else f"{reasons.total()} pairs of keyframes were"
         )
-        lines.append(f"{pairs} not linked ({counts})")
+        lines.append(f"{pairs} rejected as loop closures ({counts})")
     return "".join(f"{line}\n" for line in lines)
 
 
@@ -176,15 +176,15 @@ def merged_table(section: Mapping[str, Any]) -> list[str]:
             ("ATE cm of the maps moved rigidly, not optimised", "ate_stiff_cm"),
         )
     ]
-    counts = [str(section[name]) for name in ("keyframes", "links_between_robots", "loops")]
+    counts = [str(section[name]) for name in ("keyframes", "loop_closures_between_robots", "loops")]
     rows = [
         ("joined", ", ".join(section["joined"])),
         ("not joined", "; ".join(f"{e['robot']}: {e['reason']}" for e in section["not_joined"]) or "-"),
-        ("keyframes / links between robots / loops", " / ".join(counts)),
+        ("keyframes / loop closures between robots / within robots", " / ".join(counts)),
         *errors,
         *((f"error of the origin of {origin['robot']}", f"{origin['cm']:.1f} cm, {origin['deg']:.2f} deg")
           for origin in section["origins"]),
-        *((f"not linked {pair}", ", ".join(reasons)) for pair, reasons in rejected.items()),
+        *((f"rejected loop closures {pair}", ", ".join(reasons)) for pair, reasons in rejected.items()),
     ]  # fmt: skip
     return table(["merged map", ""], rows)
 

@@ -189,7 +189,9 @@ def cloud_document(
     }
     unknown = [*_UNAVAILABLE, *overview.problems]
     if len(robots) < len(servers):
-        unknown.insert(0, f"{len(servers) - len(robots)} of {len(servers)} servers did not tell their robots")
+        unknown.insert(
+            0, f"{len(servers) - len(robots)} of {len(servers)} servers did not report their robots"
+        )
     return {
         "time_s": time_s,
         "cloud": True,
