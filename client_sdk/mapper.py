@@ -54,7 +54,7 @@ from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.wheel_odometry import BaseCovariance, OdometryReading, WheelOdometry
-from rse_pf.errors import ConfigurationError, RsePfError, UsageError
+from rse_pf.errors import ConfigurationError, PnpError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera, orthonormalise
 from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
@@ -201,6 +201,8 @@ class Mapper:
         self._recorder = recorder
         self._wheels = None if T_base_camera is None else WheelOdometry(T_base_camera)
         self._base_covariance = BaseCovariance()
+        self._newest_segment, self._last_visual_s = 0, float("-inf")
+        self._image, self._image_s = b"", float("-inf")  # the newest image, and when it came first
         plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
         self._plugins = replace(plugins, wheels=self._wheels)
         self._processed_joins = 0  # joins that were applied; with a monocular tracker, plus its loop closures
@@ -245,17 +247,19 @@ class Mapper:
             if self._imu is not None and frame.imu is not None:
                 self._imu.add(frame.imu)
             # 3. Match the frame, and solve the pose queries that the tracker yields one after the other.
-            step = await _run_in_thread(tracker, functools.partial(tracker.prepare, frame))
+            prepare = tracker.skip if self._is_repeated(frame) else tracker.prepare
+            step = await _run_in_thread(tracker, functools.partial(prepare, frame))
             answer: PoseAnswer | None = None
-            failure = ""
+            failure, is_missing = "", False
             while isinstance(step, PoseQuery):
                 try:
-                    answer, failure = await self._ask(step), ""
+                    answer, failure, is_missing = await self._ask(step), "", False
                 except ConfigurationError:
                     _close_query(tracker, step)
                     raise
                 except RsePfError as error:
                     answer, failure = None, f"{error.code}: {error.message}"
+                    is_missing = not isinstance(error, PnpError)
                 except BaseException:
                     _close_query(tracker, step)
                     raise
@@ -266,6 +270,7 @@ class Mapper:
                     None if solution is None else solution.T_camera_world,
                     0 if solution is None else len(solution.inliers),
                     is_weak=solution is not None and solution.verdict == "weak",
+                    is_missing=is_missing,
                 )
                 step = await _run_in_thread(tracker, accept)
             # 4. Add the result to trajectory and map; apply joins, gravity and scale.
@@ -287,15 +292,15 @@ class Mapper:
         """
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
-            return self._records.first.cloud
-        return read_segment(tracker, 0, self._map_options).cloud
+            return self._records.cloud
+        return self._read_segments(tracker).cloud
 
     @property
     def trajectory(self) -> Trajectory:
         """Poses of segment 0 and of all segments that were joined to it, with all corrections."""
         if isinstance(self._tracker, MonocularTracker):
-            return self._tracker.trajectory()
-        return self._records.first.trajectory()
+            return self._read_segments(self._tracker).trajectory()
+        return self._records.trajectory()
 
     @property
     def frames(self) -> int:
@@ -397,12 +402,30 @@ class Mapper:
         """Noise of depths as measured during the drive; of a Kinect if the camera has no depth."""
         return self._tracker.noise.noise if isinstance(self._tracker, Tracker) else DepthNoise()
 
-    def restart(self, T_world_start: Array) -> None:
+    def carry(self, timestamp_s: float, odometry: Sequence[OdometryReading]) -> Array | None:
+        """Add readings of the wheels, and return ``T_world_camera`` ``(4, 4)`` as they carry it to a time.
+
+        *timestamp_s* is that of the next frame, in seconds, which is then tracked without these readings.
+        None if there is no pose, or the wheels do not tell the motion since.
+
+        Raises:
+            UsageError: As by `track`.
+        """
+        self._check_odometry(odometry)
+        if self._wheels is not None:
+            self._wheels.add(odometry)
+        if self._wheels is None or self._tracker is None or self._tracker.last_pose is None:
+            return None
+        last_s, T_world_camera = self._tracker.last_pose
+        motion = self._wheels.motion(last_s, timestamp_s)
+        return None if motion is None else orthonormalise(T_world_camera @ motion.T_camera_begin_end)
+
+    def restart(self, T_world_start: Array, timestamp_s: float | None = None) -> None:
         """Begin another world: the next frame with enough features gets the ``(4, 4)`` pose *T_world_start*.
 
-        The tracker forgets its keyframes, and gravity is estimated anew from the poses that follow.  Poses
-        and points so far stay in `trajectory` and `map`, and those that follow are added to them as they
-        are.
+        With *timestamp_s* this is the pose at that time, and wheels carry it to that frame.  The tracker
+        forgets its keyframes, and gravity is estimated anew from the poses that follow.  Poses and points so
+        far stay in `trajectory` and `map`, and those that follow are added to them as they are.
 
         Raises:
             UsageError: The camera has no depth, or no frame was tracked, or a frame is being tracked.
@@ -412,7 +435,7 @@ class Mapper:
                 "only a mapper that has tracked frames with depth can restart at a given pose",
                 hint="make another mapper with T_world_start",
             )
-        self._tracker.restart(T_world_start)
+        self._tracker.restart(T_world_start, timestamp_s)
         if self._imu is not None:
             stamps_s = self._records.first.stamps_s
             self._odometry_start_s = max(stamps_s, default=self._odometry_start_s)
@@ -570,7 +593,7 @@ class Mapper:
         """Return the keyframes of segment 0 if they are in metres, else none; only these may be shared."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
-            return self._records.first.keyframes
+            return self._records.keyframes
         if not self._keyframes_of or self.camera is None or self.scale == _UP_TO_SCALE:
             return []
         return landmark_keyframes(tracker, self.camera, self._keyframes_of)
@@ -581,6 +604,13 @@ class Mapper:
         is_sparse = isinstance(self._tracker, MonocularTracker) or self._depth_source == "stereo"
         return 1 if is_sparse else _MIN_READINGS
 
+    def _read_segments(self, tracker: MonocularTracker) -> SegmentRecord:
+        """Return segment 0 of a tracker without depth, and all that wheels have connected with its world."""
+        record = read_segment(tracker, 0, self._map_options)
+        for number in sorted(tracker.connected):
+            record.append(read_segment(tracker, number, self._map_options), np.eye(4))
+        return record
+
     def _separate_segments(self) -> list[tuple[SegmentRecord, bool]]:
         """Return the segments that were not joined to segment 0, and whether they are in metres."""
         tracker = self._tracker
@@ -589,6 +619,7 @@ class Mapper:
         return [
             (read_segment(tracker, number, self._map_options), number in self._metric_segments)
             for number in tracker.segments[1:]
+            if number not in tracker.connected
         ]
 
     # --- Check of each frame, and choice of the tracker by the first one ---
@@ -648,6 +679,8 @@ class Mapper:
                 self._depth_source = "depth" if frame.stereo is None else "stereo"
                 self._tracker = Tracker(self._options, self._T_world_start, self._plugins)
             else:
+                if self._scale is None and self._wheels is not None:
+                    self._scale = OdometryScale()
                 self._tracker = MonocularTracker(self._monocular_options, self._T_world_start, self._plugins)
         return self._tracker
 
@@ -662,6 +695,17 @@ class Mapper:
             self._T_world_start = level_start_pose(
                 _GRAVITY_OF_LEVEL_CAMERA if gravity_camera is None else gravity_camera
             )
+
+    def _is_repeated(self, frame: Frame) -> bool:
+        """Return whether an image repeats although the wheels have moved since it came first."""
+        if self._wheels is None:
+            return False
+        image = frame.rgb.tobytes()
+        if image != self._image:
+            self._image, self._image_s = image, frame.timestamp_s
+            return False
+        motion = self._wheels.motion(self._image_s, frame.timestamp_s)
+        return motion is not None and motion.is_clear
 
     # --- Result of a frame ---
 
@@ -679,22 +723,30 @@ class Mapper:
 
     def _add_base(self, wheels: WheelOdometry, tracked: TrackedFrame) -> TrackedFrame:
         """Return the result of a frame with the pose of the base, carried by the wheels if it has none."""
-        pose, last = tracked.T_world_camera, None if self._tracker is None else self._tracker.last_pose
+        tracker, pose, now_s = self._tracker, tracked.T_world_camera, tracked.frame.timestamp_s
+        last = None if tracker is None else tracker.last_pose
+        uncertainty = self._base_covariance
         if pose is not None:
             T_world_base = wheels.base_pose(pose)
-            covariance = self._base_covariance.add_visual(T_world_base, pose, tracked.covariance)
+            if tracked.segment > self._newest_segment:
+                uncertainty.begin(T_world_base, wheels.motion(self._last_visual_s, now_s))
+                self._newest_segment = tracked.segment
+            self._last_visual_s = now_s
+            world = tracked.segment, self._processed_joins, self._is_upright
+            wheels.compare(now_s, T_world_base, world)
+            covariance = uncertainty.add_visual(T_world_base, pose, tracked.covariance)
             return replace(tracked, T_world_base=T_world_base, pose_covariance=covariance)
-        motion = None if last is None else wheels.motion(last[0], tracked.frame.timestamp_s)
+        motion = None if last is None else wheels.motion(last[0], now_s)
         if last is None or motion is None:
             return tracked
-        pose = orthonormalise(last[1] @ wheels.camera_motion(motion))
+        pose = orthonormalise(last[1] @ motion.T_camera_begin_end)
         T_world_base = wheels.base_pose(pose)
         return replace(
             tracked,
             T_world_camera=pose,
             status="odometry",
             T_world_base=T_world_base,
-            pose_covariance=self._base_covariance.carried(T_world_base, motion),
+            pose_covariance=uncertainty.carried(T_world_base, motion),
         )
 
     def _finish_visual(
@@ -739,6 +791,7 @@ class Mapper:
         if isinstance(tracker, MonocularTracker):
             return self._finish_monocular(tracker, tracked, position_m)
         # 5. With depth, add the frame to the record of its segment, then apply joins and gravity.
+        self._records.connected = tracker.connected
         if pose is not None:
             record = self._records.add(tracked, pose)
             if self._adds_frames:
@@ -757,6 +810,8 @@ class Mapper:
         joins = tracker.joins[self._processed_joins :]
         for join in joins:
             self._records.join(join)
+        if joins:
+            self._base_covariance.correct()
         self._processed_joins = len(tracker.joins)
         return replace(tracked, corrected=bool(joins))
 
@@ -774,7 +829,7 @@ class Mapper:
     def _align_imu(self, tracker: Tracker) -> None:
         """Estimate gravity and biases from the poses of segment 0 since the last `restart`, in metres."""
         assert self._imu is not None
-        path = self._records.first.trajectory()
+        path = self._records.trajectory()
         first = int(np.searchsorted(path.timestamps_s, self._odometry_start_s, side="right"))
         depths_m = np.empty(0) if tracker.last_features is None else tracker.last_features.points_camera[:, 2]
         depths_m = depths_m[np.isfinite(depths_m)]
@@ -806,11 +861,15 @@ class Mapper:
         frame, segment, scale = tracked.frame, tracked.segment, self._scale
         is_corrected = tracked.keyframe
         joins_and_loops = tracker.loops + len(tracker.joins)
+        if joins_and_loops != self._processed_joins:
+            self._base_covariance.correct()
         self._metric_segments.intersection_update(tracker.segments)
         if scale is not None:
             is_known = segment in self._metric_segments
             is_due = scale.is_due(frame.timestamp_s, is_known=is_known)
             if is_due or joins_and_loops != self._processed_joins:
+                if position_m is None and self._wheels is not None:
+                    position_m = self._wheels.camera_position(frame.timestamp_s)
                 if not is_known:
                     scale.observe(frame.timestamp_s, frame.rgb, position_m)
                 if tracked.T_world_camera is not None and self._apply_scale(tracker, segment):
@@ -818,7 +877,7 @@ class Mapper:
                     newest_pose = tracker.trajectory(segment).T_world_camera[-1]
                     tracked = replace(tracked, T_world_camera=newest_pose)
         self._processed_joins = joins_and_loops
-        is_metric = segment in self._metric_segments
+        is_metric = segment in self._metric_segments or segment in tracker.connected
         return replace(tracked, corrected=is_corrected, scale="metric" if is_metric else _UP_TO_SCALE)
 
     def _apply_scale(self, tracker: MonocularTracker, segment: int) -> bool:

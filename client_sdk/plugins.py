@@ -33,7 +33,7 @@ import numpy.typing as npt
 
 from client_sdk.imu.estimator import ImuEstimator
 from client_sdk.monocular.bundle import Bundle
-from client_sdk.wheel_odometry import WheelOdometry
+from client_sdk.wheel_odometry import WheelMotion, WheelOdometry
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import MAX_DESCRIPTOR_SIZE, ORB, DescriptorKind, Descriptors
@@ -447,20 +447,30 @@ class Plugins:
         """
         return None if self.motion is None else self.motion.predict(timestamp_s)
 
-    def predict_motion(self, T_last_next: Array, last_s: float, next_s: float) -> Array:
-        """Replace the rotation of a predicted motion by the gyroscope's measurement, where there is one.
+    def predict_motion(
+        self, T_last_next: Array, last_s: float, next_s: float, *, is_metric: bool = True
+    ) -> Array:
+        """Replace a predicted motion by that of the wheels, and its rotation by the gyroscope's, if known.
 
-        *T_last_next* is changed in place, and returned.
+        *T_last_next* may be changed in place; the prediction is returned.
 
         Args:
             T_last_next: ``(4, 4)``, predicted pose of the next camera in the frame of the last one.
             last_s: Time of the last pose, in seconds.
             next_s: Time of the next frame, in seconds.
+            is_metric: Whether lengths are metres; the wheels are not used otherwise.
         """
+        wheel_motion = self.wheel_motion(last_s, next_s) if is_metric else None
+        if wheel_motion is not None:
+            T_last_next = wheel_motion.T_camera_begin_end
         R_last_next = None if self.inertial is None else self.inertial.camera_rotation(last_s, next_s)
         if R_last_next is not None:
             T_last_next[:3, :3] = R_last_next
         return T_last_next
+
+    def wheel_motion(self, begin_s: float, end_s: float) -> WheelMotion | None:
+        """Return the motion by the wheels between two times, in seconds; None if they do not tell it."""
+        return None if self.wheels is None else self.wheels.motion(begin_s, end_s)
 
     def add_pose(self, timestamp_s: float, T_world_camera: Array) -> None:
         """Store the pose of a tracked frame, from which the user's motion model predicts later poses."""

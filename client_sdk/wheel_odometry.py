@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from client_sdk.wheel_check import WheelCheck
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse, log_se3, rigid, rotation_angle_deg, skew
 
@@ -38,6 +39,8 @@ correction: the trackers drift by 0.3 to 1 % on recorded drives."""
 _DRIFT_RAD = math.radians(0.3)
 """Standard deviation of the rotation by visual odometry after one metre, in rad; it grows with the root of
 the distance since the last correction."""
+_CLEAR_MOTION_M = 0.01  # a camera that moved by this length, in metres, does not take the same image again
+_CLEAR_MOTION_RAD = 0.01  # a camera that turned by this angle, in rad, does not take the same image again
 _MIN_STEP_M = 0.02
 """Shortest step, in metres, that counts for the distance of a tracked camera: the noise of the poses of a
 stationary one is below it."""
@@ -81,13 +84,25 @@ class WheelMotion:
 
     Attributes:
         T_begin_end: ``(4, 4)``, metres: pose of the base at the end in its frame at the begin.
+        T_camera_begin_end: ``(4, 4)``, metres: the same of the camera.
         length_m: Length of the path, metres.
         angle_rad: Sum of all rotations on the path, rad.
     """
 
     T_begin_end: Array
+    T_camera_begin_end: Array
     length_m: float
     angle_rad: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the base has moved: an image must have changed."""
+        return self.length_m >= _CLEAR_MOTION_M or self.angle_rad >= _CLEAR_MOTION_RAD
+
+    @property
+    def reach_m(self) -> float:
+        """Largest plausible error of the position, metres: three standard deviations."""
+        return 3.0 * self.deviation_m
 
     @property
     def heading_deviation_rad(self) -> float:
@@ -105,7 +120,6 @@ class WheelOdometry:
 
     Attributes:
         T_base_camera: ``(4, 4)``, metres: mount of the camera on the base.
-        trouble: Why the readings are not used, as one sentence; empty while they are used.
     """
 
     def __init__(self, T_base_camera: Array) -> None:
@@ -120,13 +134,18 @@ class WheelOdometry:
                 "T_base_camera is no pose", hint="give a (4, 4) matrix: a rotation, metres, and 0 0 0 1"
             )
         self.T_base_camera: Array = mount
-        self.trouble = ""
+        self._check = WheelCheck()
         self._T_camera_base = inverse(mount)
         self._count = 0
         self._stamps_s: Array = np.empty(2 * _MAX_READINGS)
         self._poses: Array = np.empty((2 * _MAX_READINGS, 4, 4))
-        self._paths: Array = np.zeros((2 * _MAX_READINGS, 2))
-        """Length in metres and sum of rotations in rad of the path up to each reading."""
+        self._paths: Array = np.zeros((2 * _MAX_READINGS, 3))
+        """Length in metres, sum of rotations in rad, and heading in rad without wrap, up to each reading."""
+
+    @property
+    def trouble(self) -> str:
+        """Why the readings are not used, as one sentence; empty while they are used."""
+        return self._check.trouble
 
     def check(self, readings: Sequence[OdometryReading]) -> None:
         """Refuse readings that go back in time, also against those that were added before.
@@ -158,7 +177,8 @@ class WheelOdometry:
                 step = inverse(self._poses[n - 1]) @ reading.T_odom_base
                 length_m = float(np.linalg.norm(step[:3, 3]))
                 self._paths[n] = self._paths[n - 1]
-                self._paths[n] += length_m, math.radians(rotation_angle_deg(step[:3, :3]))
+                angle_rad = math.radians(rotation_angle_deg(step[:3, :3]))
+                self._paths[n] += length_m, angle_rad, math.atan2(step[1, 0], step[0, 0])
             self._stamps_s[n], self._poses[n] = reading.timestamp_s, reading.T_odom_base
             self._count = n + 1
 
@@ -190,26 +210,37 @@ class WheelOdometry:
 
         None, too, while the readings have `trouble`.
         """
-        if self.trouble:
-            return None
+        return None if self.trouble else self._measure(begin_s, end_s)
+
+    def _measure(self, begin_s: float, end_s: float) -> WheelMotion | None:
+        """Return the motion of the base between two times, also while there is `trouble`."""
         begin, end = self.pose(begin_s), self.pose(end_s)
         if begin is None or end is None:
             return None
         T_begin_end = inverse(begin) @ end
         stamps_s, paths = self._stamps_s[: self._count], self._paths[: self._count]
         length_m, angle_rad = (
-            float(np.diff(np.interp((begin_s, end_s), stamps_s, path))[0]) for path in paths.T
+            float(np.diff(np.interp((begin_s, end_s), stamps_s, path))[0]) for path in paths.T[:2]
         )
         return WheelMotion(
             T_begin_end=T_begin_end,
+            T_camera_begin_end=self._T_camera_base @ T_begin_end @ self.T_base_camera,
             length_m=max(length_m, float(np.linalg.norm(T_begin_end[:3, 3]))),
             angle_rad=max(angle_rad, math.radians(rotation_angle_deg(T_begin_end[:3, :3]))),
         )
 
-    def camera_motion(self, motion: WheelMotion) -> Array:
-        """Return the pose ``(4, 4)`` of the camera at the end of a motion in its frame at the begin."""
-        T_begin_end: Array = self._T_camera_base @ motion.T_begin_end @ self.T_base_camera
-        return T_begin_end
+    def compare(self, timestamp_s: float, T_world_base: Array, world: object) -> None:
+        """Compare the wheels with the tracked pose ``(4, 4)`` of a frame, in metres; sets `trouble`.
+
+        Poses of different *world* are not compared, such as those of two segments.
+        """
+        check = self._check
+        if not check.add(timestamp_s, T_world_base, world):
+            return
+        motion = self._measure(*check.window_s)
+        if motion is not None:
+            headings = self._stamps_s[: self._count], self._paths[: self._count, 2]
+            check.close(motion.T_begin_end, *headings)
 
     def camera_position(self, timestamp_s: float) -> Array | None:
         """Return the ``(3,)`` position of the camera in the frame of the readings; None if unknown."""
@@ -232,6 +263,7 @@ class BaseCovariance:
     def __init__(self) -> None:
         """Begin with a pose that is certain."""
         self._begin: Array = np.zeros((6, 6))
+        self._before: Array = np.zeros((6, 6))
         self._begin_position: Array | None = None
         self._counted_position: Array = np.zeros(3)
         self._distance_m = 0.0
@@ -239,12 +271,17 @@ class BaseCovariance:
         self._last_position: Array = np.zeros(3)
 
     def correct(self) -> None:
-        """Begin anew with a certain pose: a recognised place has removed the drift."""
-        self._begin, self._begin_position = np.zeros((6, 6)), None
+        """Begin anew with the covariance before the present segment: a recognised place removes its drift."""
+        self._begin, self._begin_position = self._before, None
 
-    def begin(self, covariance: Array) -> None:
-        """Begin anew with a pose of a given covariance: that of a new segment, carried by wheels."""
-        self._begin, self._begin_position = covariance, None
+    def begin(self, T_world_base: Array, motion: WheelMotion | None) -> None:
+        """Begin anew with the first pose ``(4, 4)`` of a segment, to which *motion* has carried the last one.
+
+        Without a motion the segment has a world of its own, in which its first pose is certain.
+        """
+        self._before = self._last
+        self._begin = np.zeros((6, 6)) if motion is None else self.carried(T_world_base, motion)
+        self._begin_position = None
 
     def add_visual(self, T_world_base: Array, T_world_camera: Array, of_answer: Array | None) -> Array:
         """Return the covariance of a tracked pose.

@@ -11,7 +11,8 @@ the segment is aligned.
 pose uses it, and the first tracked frame after a correction of its segment has ``corrected`` set.
 
 **Segments.**  A segment is one odometry frame.  After `LiveOptions.segment_after` lost frames with enough
-features a new segment begins: its first pose is the last known one, and it has an alignment of its own.
+features a new segment begins: its first pose is the last known one, and it has an alignment of its own.  With
+wheel odometry it begins earlier, at the carried pose, and keeps the last alignment until it has its own.
 
 **A camera without depth** is tracked up to scale.  Its keyframes are sent in the unit of their segment, each
 when two newer ones exist.  The map finds the metric scale (`LiveMapper.metres_per_unit`), so that
@@ -47,6 +48,7 @@ from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction
 from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.tracking.monocular_segment import AdjustedKeyframe
 from client_sdk.tracking.monocular_tracker import MonocularTracker
+from client_sdk.tracking.segment_join import carried_segment_after
 from client_sdk.tracking.segments import add_to_cloud
 from client_sdk.trajectory import Trajectory
 from client_sdk.wheel_odometry import OdometryReading
@@ -176,6 +178,8 @@ class LiveMapper:
         self._monocular_odometry: MonocularOdometry | None = None
         self._alignments = Alignments()
         self._correction_stream = CorrectionStream()
+        self._continued: dict[int, int] = {}
+        """The segment whose world a segment continues, because the wheels have carried the pose."""
         self._is_corrected = False  # whether the present segment was corrected since the last frame
         self._segment = self._first_segment = 0
         self._last_keyframe: Array | None = None
@@ -279,9 +283,12 @@ class LiveMapper:
                     hint="wait until the camera delivers depth; leave depth=True out if it never does",
                 )
             # 2. Begin another segment at the last known pose, if tracking was lost for too long.
-            if self._mapper.unrecognised >= self.options.segment_after and self._poses:
-                self._mapper.restart(self._poses[-1][2])
-                self._begin_segment()
+            if self._poses and self._mapper.unrecognised:
+                carried = self._mapper.carry(frame.timestamp_s, odometry)
+                odometry = ()
+                after = self.options.segment_after
+                if self._mapper.unrecognised >= (after if carried is None else carried_segment_after(after)):
+                    self._restart(carried, frame.timestamp_s)
             # 3. Track the frame.
             tracked = await self._mapper.track(frame, odometry=odometry)
             # 4. Without depth, queue the settled keyframes of the tracker.
@@ -299,7 +306,7 @@ class LiveMapper:
             tracked = replace(
                 tracked,
                 segment=self._segment,
-                T_map_camera=None if pose is None else self._alignments.get(self._segment).pose_in_map(pose),
+                T_map_camera=None if pose is None else self._pose_in_map(pose),
                 corrected=self._is_corrected,
             )
             self._is_corrected = False
@@ -543,6 +550,30 @@ class LiveMapper:
 
     # --- Segments, and the making of keyframes ---
 
+    def _restart(self, carried: Array | None, timestamp_s: float) -> None:
+        """Begin another segment at the pose that the wheels have carried to a time, else at the last one.
+
+        With a carried pose it continues the world of the segment before, and its alignment until it has one.
+        """
+        if carried is None:
+            self._mapper.restart(self._poses[-1][2])
+        else:
+            self._mapper.restart(carried, timestamp_s)
+            self._continued[self._segment + 1] = self._segment
+        self._begin_segment()
+
+    def _pose_in_map(self, T_odom_camera: Array) -> Array | None:
+        """Return ``T_map_camera`` ``(4, 4)`` of a pose in the present odometry frame; None if not aligned.
+
+        While the segment is not aligned, the alignment of the segments that it continues holds.
+        """
+        segment = self._segment
+        while (T_map_camera := self._alignments.get(segment).pose_in_map(T_odom_camera)) is None:
+            if segment not in self._continued:
+                return None
+            segment = self._continued[segment]
+        return T_map_camera
+
     def _begin_segment(self) -> None:
         """Begin another segment; its first keyframe is relocalised without a pause."""
         self._segment += 1
@@ -590,7 +621,9 @@ class LiveMapper:
             self._last_keyframe_s = keyframe.timestamp_s
             await self._queue_keyframe(data, T_odom_camera)
         pose = odometry.pose_in_odometry(T_world_camera)
-        return replace(tracked, T_world_camera=pose, scale="up to scale")
+        return replace(
+            tracked, T_world_camera=pose, scale="up to scale", T_world_base=None, pose_covariance=None
+        )
 
     async def _queue_keyframe(self, data: bytes, T_odom_camera: Array) -> bool:
         """Queue an encoded keyframe, and relocalise it if that is due; return False if the queue is full."""

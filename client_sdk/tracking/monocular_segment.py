@@ -181,6 +181,8 @@ class MonocularSegment:
         frames: Poses of all frames of the segment.
         reference: The reference keyframe, around which frames are tracked.
         reference_landmarks: Number of landmarks that it saw when it became the reference.
+        is_metric: Whether the unit is a metre.
+        origin: ``(3,)``, the position that a change of the unit leaves in its place.
     """
 
     map: LandmarkMap
@@ -188,6 +190,8 @@ class MonocularSegment:
     frames: list[_RelativePose] = field(default_factory=list)
     reference: int = 0
     reference_landmarks: int = 0
+    is_metric: bool = False
+    origin: Array = field(default_factory=lambda: np.zeros(3))
 
     def set_reference(self, keyframe: int) -> None:
         """Match further frames with the landmarks of a keyframe and its neighbours."""

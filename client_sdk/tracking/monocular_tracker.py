@@ -61,12 +61,21 @@ from client_sdk.tracking.reachability import (
     DRIFT_DEPTH_SHARE,
     MAX_DRIFT,
     REACH_DEPTH_SHARE,
+    Reach,
     reach_after,
     reach_at_begin,
 )
-from client_sdk.tracking.segment_join import NOT_JOINED, Join
+from client_sdk.tracking.segment_join import (
+    NOT_JOINED,
+    REPEATED,
+    Join,
+    carried_segment_after,
+    root_of,
+    without_segment,
+)
 from client_sdk.tracking.waiting_frames import MIN_START_MATCHES, Start, WaitingFrames
 from client_sdk.trajectory import Trajectory
+from client_sdk.wheel_odometry import WheelMotion
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, scaled, transform
 from rse_pf.slam.tracking import GuidedMatchLimits
@@ -86,6 +95,9 @@ _START_DEPTH = 2.0
 to 0.0001 units in a pose query does not matter."""
 _WIDE_SEARCH_FACTOR = 2.5
 """Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
+_MIN_BASELINE_M = 0.05
+"""Shortest motion of the camera by wheels between the two views that begin a segment, in metres, that gives
+the scale of the segment until a source of scale does: in a shorter one the slip of single steps is large."""
 _TRACKED_RATIO = 0.25
 """Smallest share of inliers among the matches that a query sent, for its pose to be accepted."""
 _LOOP_CANDIDATES = 2
@@ -194,6 +206,9 @@ class MonocularTracker:
         self._state = _TrackState()
         self._segments: dict[int, MonocularSegment] = {}
         self._next_segment = 0
+        self._anchors: dict[int, int] = {}
+        """The segment in whose world a segment began, because the wheels had carried the pose."""
+        self._has_missing_answer = False
         self._waiting = WaitingFrames(self.options.start_parallax_deg)
         self._frame: Frame  # the frame that is tracked, set by `prepare`
         self._raw: Features  # its features
@@ -224,6 +239,13 @@ class MonocularTracker:
             return None
         timestamp_s, T_camera_world = self._present.last_pose
         return timestamp_s, self._T_world_start @ inverse(T_camera_world)
+
+    @property
+    def connected(self) -> frozenset[int]:
+        """Numbers of the segments, without the first one, that wheels have connected with its world."""
+        return frozenset(
+            number for number in self._anchors if root_of(self._anchors, number) == min(self._segments)
+        )
 
     @property
     def segments(self) -> tuple[int, ...]:
@@ -281,12 +303,40 @@ class MonocularTracker:
                 hint="use one tracker per camera",
             )
         self.frames += 1
+        self._has_missing_answer = False
         self._frame, view = frame, self._extract(frame)
         self._raw = view.features
         return self._open.begin(self._track(view))
 
+    def skip(self, frame: Frame) -> TrackedFrame:
+        """Lose the next frame without looking at its image, which repeats while the wheels turn.
+
+        Raises:
+            UsageError: The last query was not answered yet.
+        """
+        self._open.refuse_open()
+        self.frames += 1
+        self.lost_frames += 1
+        return TrackedFrame(
+            frame=frame,
+            T_world_camera=None,
+            keyframe=False,
+            inliers=0,
+            matches=0,
+            status="lost",
+            reason=REPEATED,
+            segment=self.segment,
+            scale="up to scale",
+        )
+
     def accept(
-        self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
+        self,
+        query: PoseQuery,
+        T_camera_world: Array | None,
+        inliers: int = 0,
+        *,
+        is_weak: bool = False,
+        is_missing: bool = False,
     ) -> PoseQuery | TrackedFrame:
         """Take the answer to *query*; return another query, or the result of the frame.
 
@@ -297,11 +347,13 @@ class MonocularTracker:
             inliers: Number of correspondences that agree with the pose.
             is_weak: Whether the service calls the evidence for the pose weak; the frame becomes no keyframe
                 then.
+            is_missing: Whether there was no answer.  With wheel odometry such a frame does not count as
+                unrecognised.
 
         Raises:
             UsageError: *query* is not the open one.
         """
-        return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak))
+        return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak, is_missing))
 
     def trajectory(self, segment: int = 0) -> Trajectory:
         """Return all poses of a segment in the order of time, as its keyframes are adjusted now.
@@ -348,16 +400,20 @@ class MonocularTracker:
     def rescale(self, scale: float, segment: int = 0) -> None:
         """Multiply all lengths of a segment by *scale*, such as by the metres per unit.
 
-        The lengths are multiplied about the position of *T_world_start*, where segment 0 begins.  The poses
-        and points of the segment that were returned before change, but for a pose at that position.  A
-        segment that does not exist is ignored.
+        The lengths are multiplied about the position of *T_world_start*, where segment 0 begins; those of a
+        segment that wheels have connected about its first position.  The poses and points of the segment that
+        were returned before change, but for a pose at that position.  A segment that does not exist is
+        ignored.
         """
         if segment not in self._segments:
             return
-        self._segments[segment].move(np.eye(4), scale)
+        own, T_new_old = self._segments[segment], np.eye(4)
+        T_new_old[:3, 3] = (1.0 - scale) * own.origin
+        own.move(T_new_old, scale)
+        own.is_metric = True
         self._state = replace(self._state, candidate=None)
         if segment == self._state.segment:
-            self._move_state(np.eye(4), scale)
+            self._move_state(T_new_old, scale)
 
     def turn(self, T_new_old: Array) -> None:
         """Express all poses in a rotated world, such as after gravity became known.
@@ -406,30 +462,53 @@ class MonocularTracker:
     def _predict_pose(self, last: PosedView) -> Array:
         """Predict ``T_camera_world`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
 
-        Otherwise the motion between the last two frames is repeated, whatever time has passed.  Its rotation
-        is replaced by that of the gyroscope, where there is one.
+        Otherwise the motion between the last two frames is repeated, whatever time has passed; that of the
+        wheels takes its place in a metric segment.  The rotation is replaced by that of the gyroscope, where
+        there is one.
         """
         state, now_s = self._state, self._frame.timestamp_s
         T_world_camera = self._plugins.predict_pose(now_s)
         if T_world_camera is not None:
             return inverse(T_world_camera)
-        T_last_next = self._plugins.predict_motion(inverse(state.T_next_last), state.timestamp_s, now_s)
+        T_last_next = self._plugins.predict_motion(
+            inverse(state.T_next_last), state.timestamp_s, now_s, is_metric=self._present.is_metric
+        )
         predicted: Array = inverse(T_last_next) @ last.T_camera_world
         return predicted
+
+    def _carry(self, timestamp_s: float) -> tuple[Array, WheelMotion] | None:
+        """Return ``T_camera_world`` ``(4, 4)``, carried by the wheels to a time, and their motion since.
+
+        None without a metric pose, and if the wheels do not tell the motion.
+        """
+        if not self._segments or not self._present.is_metric:
+            return None
+        last_s, T_camera_world = self._present.last_pose
+        motion = self._plugins.wheel_motion(last_s, timestamp_s)
+        if motion is None:
+            return None
+        return inverse(motion.T_camera_begin_end) @ T_camera_world, motion
 
     def _match_around_last_pose(self, view: MonocularView) -> Iterator[_Attempt]:
         """Match a frame near the predicted pixels, then in a wider radius, then with the last frame.
 
-        There is no attempt after a loss.
+        After a loss, frames are matched only near the pixels that a pose carried by the wheels predicts.
         """
         last, number, min_inliers = self._state.last, self._state.segment, self.options.min_inliers
-        if last is None:
+        carried = self._carry(self._frame.timestamp_s) if last is None else None
+        if last is not None:
+            T_predicted = self._predict_pose(last)
+        elif carried is not None:
+            T_predicted = carried[0]
+        else:
             return
-        T_predicted, min_guided_matches = self._predict_pose(last), GUIDED_MATCHES_FACTOR * min_inliers
+        min_guided_matches = GUIDED_MATCHES_FACTOR * min_inliers
         for factor in (1.0, _WIDE_SEARCH_FACTOR):
             limits = GuidedMatchLimits(radius_px=factor * self.options.search_px)
             matches = self._present.match(view, T_predicted, limits)
             yield _Attempt(matches=matches, segment=number, against="map", min_matches=min_guided_matches)
+        if last is None:
+            return
         matches = self._present.match_last_frame(view, last)
         yield _Attempt(matches=matches, segment=number, against="frame", min_matches=min_inliers)
 
@@ -467,6 +546,7 @@ class MonocularTracker:
                 continue
             # 1. Solve the pose by a query.
             answer = yield self._make_query(view, attempt.matches, attempt.against)
+            self._has_missing_answer |= answer.is_missing
             reason = "the matches agree on no pose"
             # 2. Far from the newest keyframes, only a clear answer is accepted: perceptual aliases, places
             #    that look alike, exist.
@@ -481,7 +561,8 @@ class MonocularTracker:
             if posed is None:
                 continue
             # 4. Accept a known place only if the camera can have moved there: another one may look the same.
-            if keyframe is not None and not self._is_reachable(posed, attempt):
+            is_sought = keyframe is not None or self._state.last is None
+            if is_sought and not self._is_reachable(posed, attempt):
                 reason = "a place to which the camera cannot have moved"
                 continue
             if keyframe is not None:
@@ -553,9 +634,15 @@ class MonocularTracker:
         """Return whether the camera can have moved to a recognised place since its last pose.
 
         A frame after a tracked one may be anywhere near its pose: the motion between two images can change.
+        After a loss, wheels tell where it can have moved.
         """
         position, last = inverse(posed.T_camera_world)[:3, 3], self._state.last
         distance = float(np.median(np.linalg.norm(attempt.matches.points - position, axis=1)))
+        carried = None if last is not None else self._carry(self._frame.timestamp_s)
+        own_root = root_of(self._anchors, self._state.segment)
+        if carried is not None and root_of(self._anchors, attempt.segment) == own_root:
+            by_wheels = Reach(inverse(carried[0])[:3, 3], carried[1].reach_m)
+            return by_wheels.excess(position) <= REACH_DEPTH_SHARE * distance
         moved = math.inf
         if last is not None and attempt.segment == self._state.segment:
             moved = float(np.linalg.norm(position - inverse(last.T_camera_world)[:3, 3]))
@@ -568,12 +655,18 @@ class MonocularTracker:
         """Let a frame without a pose wait for a second view; or begin a segment with it as the second view.
 
         A frame with fewer than 100 features is lost without waiting.  A segment after the first begins only
-        if more than ``segment_after`` frames with 100 features or more came since the last pose.
+        if more than ``segment_after`` frames with 100 features or more came since the last pose; earlier
+        where wheels carry the pose, and then not by frames whose queries nobody has answered.
         """
-        if len(view.features) >= MIN_START_MATCHES:
+        carried = self._carry(self._frame.timestamp_s)
+        if carried is not None and self._has_missing_answer:
+            reason = "no answer"
+        elif len(view.features) >= MIN_START_MATCHES:
             self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
             start, start_reason = self._waiting.find_start(view, self._frame.camera)
-            may_begin = not self._segments or self._state.unrecognised > self.options.segment_after
+            after = self.options.segment_after
+            after = after if carried is None else carried_segment_after(after)
+            may_begin = not self._segments or self._state.unrecognised > after
             if start is not None and may_begin:
                 return self._begin_segment(view, start)
             self._waiting.add(self._frame.timestamp_s, view)
@@ -618,6 +711,10 @@ class MonocularTracker:
         )
         if not is_first:
             self.lost_frames -= len(segment.frames)
+            if self._connect(segment, first_s):
+                self._anchors[number] = self._state.segment
+                second = new_map.keyframes[1]
+                T_before = None
         # 3. Keep the present frame as the last one, from which the next frame is tracked.
         posed = PosedView(
             view=view,
@@ -633,6 +730,25 @@ class MonocularTracker:
             T_next_last=np.eye(4) if T_before is None else second.T_camera_world @ inverse(T_before),
         )
         return self._make_result(posed, is_keyframe=True)
+
+    def _connect(self, segment: MonocularSegment, first_s: float) -> bool:
+        """Move a new segment to where the wheels have carried the last pose; return whether they tell it.
+
+        *first_s* is the time of its first view; lengths become metres by the motion of the wheels between the
+        first two views.
+        """
+        carried = self._carry(first_s)
+        baseline = self._plugins.wheel_motion(first_s, self._frame.timestamp_s)
+        if carried is None or baseline is None:
+            return False
+        length_m = float(np.linalg.norm(baseline.T_camera_begin_end[:3, 3]))
+        if length_m < _MIN_BASELINE_M:
+            return False
+        length = float(np.linalg.norm(segment.map.keyframes[1].T_camera_world[:3, 3]))
+        T_world_first = inverse(carried[0])
+        segment.move(T_world_first, length_m / length)
+        segment.length_factor, segment.is_metric, segment.origin = 1.0, True, T_world_first[:3, 3]
+        return True
 
     # --- Keep ---
 
@@ -686,7 +802,7 @@ class MonocularTracker:
         assert last is not None
         segment = self._present
         segment.add_frame(self._frame.timestamp_s, last.T_camera_world, segment.reference)
-        is_joined = self._state.segment == min(self._segments)
+        is_joined = root_of(self._anchors, self._state.segment) == min(self._segments)
         return TrackedFrame(
             frame=self._frame,
             T_world_camera=self._T_world_start @ inverse(last.T_camera_world),
@@ -861,6 +977,7 @@ class MonocularTracker:
         start = self._T_world_start
         T_into_segment = start @ similarity.T @ scaled(inverse(start), similarity.scale)
         self.joins.append(Join(segment, similarity.segment, T_into_segment, similarity.scale))
+        self._anchors = without_segment(self._anchors, segment)
         if segment == self._state.segment:
             self._state = replace(self._state, segment=similarity.segment)
             into.set_reference(newer.reference + first_keyframe)

@@ -40,11 +40,13 @@ class QueryAnswer:
             if there is no pose.
         inliers: Number of correspondences that agree with the pose.
         is_weak: Whether the solver calls the evidence for the pose weak.
+        is_missing: Whether nobody has answered, so that it is not known whether there is a pose.
     """
 
     T_camera_world: Array | None
     inliers: int
     is_weak: bool
+    is_missing: bool = False
 
     def accepted_pose(self, min_inliers: float) -> Array | None:
         """Return the pose as a rigid motion; None if it is none, or fewer than *min_inliers* agree."""

@@ -2,19 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from client_sdk.tracking.landmark_matching import MAX_JOIN_DIFFERENCE_DEG
 from rse_pf.geometry import Array, pose_difference
 
-__all__ = ["NOT_JOINED", "Join", "JoinCandidate"]
+__all__ = [
+    "NOT_JOINED",
+    "REPEATED",
+    "Join",
+    "JoinCandidate",
+    "carried_segment_after",
+    "root_of",
+    "without_segment",
+]
 
 NOT_JOINED = "in a segment that is not joined to the first one yet"
 """`TrackedFrame.reason` of a frame that has a pose, but in the world of its own segment and not in that of
 the first segment."""
+REPEATED = "the image repeats while the wheels turn"
+"""`TrackedFrame.reason` of a frame whose image is that of the frame before, although the wheels moved."""
 _MAX_JOIN_DIFFERENCE_M = 0.15
 """Largest translation, in metres, between two measurements of the pose of one segment in another one, for the
 two to confirm each other."""
+
+
+_CARRIED_SHARE = 3
+"""A segment whose first pose is carried by wheels begins after this share of the unrecognised frames: it
+begins at its place, so that little is lost if an older place would have been recognised soon."""
+
+
+def carried_segment_after(segment_after: int) -> int:
+    """Return after how many unrecognised frames a segment begins whose first pose the wheels have carried.
+
+    It is a third of *segment_after*, the number without wheels, rounded up.
+    """
+    return -(-segment_after // _CARRIED_SHARE)
+
+
+def root_of(anchors: Mapping[int, int], segment: int) -> int:
+    """Return the number of the segment in whose world a segment is, by connections as in `without_segment`.
+
+    It is its own number if wheels have not connected it.
+    """
+    while segment in anchors:
+        segment = anchors[segment]
+    return segment
+
+
+def without_segment(anchors: Mapping[int, int], segment: int) -> dict[int, int]:
+    """Return the connections by wheels, as segment and segment before it, after *segment* was joined.
+
+    Segments that continued its world continue that which it had continued; they are not connected any more
+    if there is none.
+    """
+    kept = {number: anchor for number, anchor in anchors.items() if segment not in (number, anchor)}
+    if segment in anchors:
+        kept.update({number: anchors[segment] for number, anchor in anchors.items() if anchor == segment})
+    return kept
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ functions that read them out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -157,6 +157,8 @@ class DriveRecords:
     def __init__(self, options: MapOptions) -> None:
         self._options = options
         self._segments: dict[int, SegmentRecord] = {0: SegmentRecord(cloud=PointMap(options))}
+        self.connected: Collection[int] = ()
+        """Numbers of the segments that wheels have connected with the world of the first one."""
 
     @property
     def first(self) -> SegmentRecord:
@@ -164,9 +166,45 @@ class DriveRecords:
         return self._segments[0]
 
     @property
+    def _world(self) -> list[SegmentRecord]:
+        """The first segment, and all that wheels have connected with its world."""
+        later = (self._segments[number] for number in sorted(self.connected) if number in self._segments)
+        return [self.first, *later]
+
+    @property
+    def cloud(self) -> PointMap:
+        """Points of the first segment and of the connected ones; a new map if there are such."""
+        first, *later = self._world
+        if not later:
+            return first.cloud
+        cloud = PointMap(self._options)
+        for record in (first, *later):
+            cloud.add_map(record.cloud, np.eye(4))
+        return cloud
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """Keyframes of the first segment and of the connected ones."""
+        return [keyframe for record in self._world for keyframe in record.keyframes]
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of the first segment and of the connected ones in the order of time."""
+        whole = SegmentRecord(
+            cloud=self.first.cloud,
+            stamps_s=[stamp_s for record in self._world for stamp_s in record.stamps_s],
+            poses=[pose for record in self._world for pose in record.poses],
+        )
+        return whole.trajectory()
+
+    @property
     def apart(self) -> list[SegmentRecord]:
-        """The segments with poses that were not joined to the first one, in the order of their numbers."""
-        return [record for number, record in sorted(self._segments.items()) if number and record.poses]
+        """The segments with poses that are not in the world of the first one, in the order of their
+        numbers."""
+        return [
+            record
+            for number, record in sorted(self._segments.items())
+            if number and record.poses and number not in self.connected
+        ]
 
     def add(self, tracked: TrackedFrame, pose: Array) -> SegmentRecord:
         """Add a frame with its pose ``(4, 4)`` to its segment, and return the record of the segment."""
@@ -294,8 +332,8 @@ def make_keyframe(tracked: TrackedFrame, pose: Array, features: Features, robot:
 def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) -> list[Keyframe]:
     """Return the keyframes of the first segment of a tracker without depth, as they are adjusted now.
 
-    All have the number 0, which `Mapper.encoded_map` replaces.  Features without a landmark have no point
-    (NaN).
+    Those of segments that wheels have connected with its world follow.  All have the number 0, which
+    `Mapper.encoded_map` replaces.  Features without a landmark have no point (NaN).
 
     Args:
         tracker: The tracker.
@@ -314,7 +352,8 @@ def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) ->
             points_camera=camera.back_project(adjusted.features.pixels, adjusted.depths).astype(np.float32),
             kind=adjusted.features.kind,
         )
-        for adjusted in tracker.keyframes_of(min(tracker.segments, default=0))
+        for segment in (min(tracker.segments, default=0), *sorted(tracker.connected))
+        for adjusted in tracker.keyframes_of(segment)
     ]
 
 

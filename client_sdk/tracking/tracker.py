@@ -49,8 +49,17 @@ from client_sdk.tracking.rolling_shutter import (
     measure_readout_change,
     rotation_rate,
 )
-from client_sdk.tracking.segment_join import NOT_JOINED, Join, JoinCandidate
+from client_sdk.tracking.segment_join import (
+    NOT_JOINED,
+    REPEATED,
+    Join,
+    JoinCandidate,
+    carried_segment_after,
+    root_of,
+    without_segment,
+)
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
+from client_sdk.wheel_odometry import WheelMotion
 from rse_pf.geometry import Array, inverse, orthonormalise, pose_difference, rigid, transform
 from rse_pf.slam.tracking import GuidedMatchLimits, fit_pose
 
@@ -174,9 +183,9 @@ class Tracker:
     with the newest keyframes and with the most similar keyframes of all segments; such a place is accepted
     only if the camera can have moved there.  Otherwise the frame is lost, and the next one is tried in the
     same order.  After `FrontEndOptions.segment_after` unrecognised frames a new segment begins at the last
-    accepted pose.  Two segments are joined when two measurements in a row agree where one lies in the other,
-    under the same condition; the newer segment is moved into the older one.  A frame with a weak pose never
-    becomes a keyframe.
+    accepted pose, or at that to which the wheels have carried it.  Two segments are joined when two
+    measurements in a row agree where one lies in the other, under the same condition; the newer segment is
+    moved into the older one.  A frame with a weak pose never becomes a keyframe.
 
     Attributes:
         options: Options of the front end.
@@ -212,6 +221,10 @@ class Tracker:
         self._state = _TrackState(T_world_camera=self._T_world_start)
         self._segments: dict[int, KeyframeMap] = {}
         self._next_segment = 0
+        self._anchors: dict[int, int] = {}
+        """The segment in whose world a segment began, because the wheels had carried the pose."""
+        self._has_pose = False
+        self._has_missing_answer = False
         self._adjusted_frames = 0
         self._pending_readout_s = 0.0
         self._frame: Frame  # the frame that is tracked, set by `prepare`
@@ -236,9 +249,16 @@ class Tracker:
     def last_pose(self) -> tuple[float, Array] | None:
         """Time in seconds and ``T_world_camera`` ``(4, 4)`` of the last accepted pose; None before the first.
 
-        The pose is in the present segment, with its corrections.
+        The pose is in the present segment, with its corrections; after `restart` it is the given one.
         """
-        return (self._state.timestamp_s, self._state.T_world_camera) if self._segments else None
+        return (self._state.timestamp_s, self._state.T_world_camera) if self._has_pose else None
+
+    @property
+    def connected(self) -> frozenset[int]:
+        """Numbers of the segments, without the first one, that wheels have connected with its world."""
+        return frozenset(
+            number for number in self._anchors if root_of(self._anchors, number) == min(self._segments)
+        )
 
     @property
     def unrecognised(self) -> int:
@@ -249,11 +269,12 @@ class Tracker:
         """
         return self._state.unrecognised
 
-    def restart(self, T_world_start: Array) -> None:
+    def restart(self, T_world_start: Array, timestamp_s: float | None = None) -> None:
         """Forget all segments: the next frame with enough features begins segment 0 at *T_world_start*.
 
-        *T_world_start* is the ``(4, 4)`` pose ``T_world_camera`` of that frame.  The counts of frames and
-        keyframes, the joins and all estimates (depth noise, readout time, disparity offset) are kept.
+        *T_world_start* is the ``(4, 4)`` pose ``T_world_camera`` of that frame; with *timestamp_s* it is that
+        at this time, from which the wheels carry it to that frame.  The counts of frames and keyframes, the
+        joins and all estimates (depth noise, readout time, disparity offset) are kept.
 
         Raises:
             UsageError: A query is open.
@@ -261,8 +282,13 @@ class Tracker:
         self._open.refuse_open()
         self._T_world_start = T_world_start
         self._segments.clear()
+        self._anchors.clear()
         self._next_segment = 0
-        self._state = _TrackState(T_world_camera=T_world_start, timestamp_s=self._state.timestamp_s)
+        self._has_pose = timestamp_s is not None
+        self._state = _TrackState(
+            T_world_camera=T_world_start,
+            timestamp_s=self._state.timestamp_s if timestamp_s is None else timestamp_s,
+        )
 
     def turn(self, T_new_old: Array) -> None:
         """Express all poses in a rotated world, such as after gravity became known.
@@ -328,14 +354,41 @@ class Tracker:
         self.frames += 1
         self._interval_s = max(_MIN_INTERVAL_S, frame.timestamp_s - self._state.timestamp_s)
         self._frame = frame
+        self._has_missing_answer = False
         self._raw = self._extract(frame)
         self.noise.model = frame.depth_noise
         # The rolling shutter is undone at the last rotation rate, until the pose of this frame is known.
         view = correct_view(self._raw, self.readout.readout_s, self._state.rotation_rate)
         return self._open.begin(self._track(view))
 
+    def skip(self, frame: Frame) -> TrackedFrame:
+        """Lose the next frame without looking at its image, which repeats while the wheels turn.
+
+        Raises:
+            UsageError: The last query was not answered yet.
+        """
+        self._open.refuse_open()
+        self.frames += 1
+        self.lost_frames += 1
+        return TrackedFrame(
+            frame=frame,
+            T_world_camera=None,
+            keyframe=False,
+            inliers=0,
+            matches=0,
+            status="lost",
+            reason=REPEATED,
+            segment=self.segment,
+        )
+
     def accept(
-        self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
+        self,
+        query: PoseQuery,
+        T_camera_world: Array | None,
+        inliers: int = 0,
+        *,
+        is_weak: bool = False,
+        is_missing: bool = False,
     ) -> PoseQuery | TrackedFrame:
         """Take the answer to *query*; return another query, or the result of the frame.
 
@@ -347,11 +400,13 @@ class Tracker:
             inliers: Number of correspondences that agree with the pose.
             is_weak: Whether the service calls the evidence for the pose weak; the frame then changes no
                 landmark and becomes no keyframe.
+            is_missing: Whether there was no answer.  With wheel odometry such a frame does not count as
+                unrecognised.
 
         Raises:
             UsageError: *query* is not the open one.
         """
-        return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak))
+        return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak, is_missing))
 
     # --- The steps of one frame ---
 
@@ -403,16 +458,38 @@ class Tracker:
         T_last_next = self._plugins.predict_motion(state.T_last_next.copy(), state.timestamp_s, now_s)
         return orthonormalise(state.T_world_camera @ T_last_next)
 
+    def _carry(self) -> tuple[Array, WheelMotion | None]:
+        """Return the last pose ``(4, 4)`` carried by the wheels to this frame, and their motion.
+
+        Without a motion by the wheels it is the last pose itself.
+        """
+        state = self._state
+        motion = self._plugins.wheel_motion(state.timestamp_s, self._frame.timestamp_s)
+        if motion is None or not self._has_pose:
+            return state.T_world_camera, None
+        return orthonormalise(state.T_world_camera @ motion.T_camera_begin_end), motion
+
     def _match_around_last_pose(self, view: View) -> Iterator[_Attempt]:
         """Match a frame near the pixels that the motion predicts, with the last frame, and widely.
 
-        The wide search around the last pose is for stereo pairs only.  There is no attempt after a loss.
+        The wide search around the last pose is for stereo pairs only.  After a loss, the only attempt is
+        near the pixels that a pose carried by the wheels predicts.
         """
         state, noise, min_inliers = self._state, self.noise.noise, self.options.min_inliers
+        guided = GuidedMatchLimits(radius_px=self.options.search_px)
         if state.last is None:
+            T_carried, motion = self._carry()
+            if motion is not None:
+                yield _Attempt(
+                    matches=self._map.match(view, T_carried, guided, None, noise),
+                    segment=state.segment,
+                    T_world_reference=T_carried,
+                    against="map",
+                    min_matches=GUIDED_MATCHES_FACTOR * min_inliers,
+                    min_ratio=_GUIDED_RATIO,
+                )
             return
         T_predicted, T_last = self._predict_pose(), state.T_world_camera
-        guided = GuidedMatchLimits(radius_px=self.options.search_px)
         yield _Attempt(
             matches=self._map.match(view, T_predicted, guided, self._state.last, noise),
             segment=state.segment,
@@ -491,7 +568,7 @@ class Tracker:
             if posed is None:
                 continue
             # 4. Accept a known place only if the camera can have moved there: another one may look the same.
-            if attempt.is_recognised and not self._is_reachable(posed, attempt):
+            if (attempt.is_recognised or self._state.last is None) and not self._is_reachable(posed, attempt):
                 continue
             if attempt.segment != self._state.segment:
                 self._state = replace(self._state, segment=attempt.segment, last=None, join_candidate=None)
@@ -517,6 +594,7 @@ class Tracker:
             T_world_reference=attempt.T_world_reference,
             depth_noise=None if self._frame.stereo is None else self.noise.noise,
         )
+        self._has_missing_answer |= answer.is_missing
         sent = min(len(attempt.matches), self._max_matches)
         T_camera_reference = answer.accepted_pose(max(self.options.min_inliers, attempt.min_ratio * sent))
         if T_camera_reference is None:
@@ -540,17 +618,27 @@ class Tracker:
         """Return whether a pose lies near the last one in the same segment.
 
         It does if the camera moved by at most the median distance of the matched landmarks, whatever time
-        passed: a view from farther away shows another scene.  Rotations are not limited.
+        passed: a view from farther away shows another scene.  Rotations are not limited.  After a loss the
+        pose that the wheels have carried takes the place of the last one.
         """
         position = T_world_camera[:3, 3]
-        moved_m = np.linalg.norm(position - self._state.T_world_camera[:3, 3])
+        last = self._state.T_world_camera if self._state.last is not None else self._carry()[0]
+        moved_m = np.linalg.norm(position - last[:3, 3])
         return attempt.segment == self._state.segment and bool(moved_m <= attempt.distance_to(position))
 
     def _is_reachable(self, posed: PosedView, attempt: _Attempt) -> bool:
         """Return whether the camera can have moved to a recognised place since its last pose.
 
         A frame after a tracked one may be anywhere near its pose: the motion between two images can change.
+        After a loss, wheels tell where it can have moved.
         """
+        T_carried, motion = (None, None) if self._state.last is not None else self._carry()
+        if motion is not None and T_carried is not None:
+            own_root = root_of(self._anchors, self._state.segment)
+            if root_of(self._anchors, attempt.segment) == own_root:
+                reach = Reach(T_carried[:3, 3], motion.reach_m)
+                position = posed.T_world_camera[:3, 3]
+                return reach.excess(position) <= REACH_DEPTH_SHARE * attempt.distance_to(position)
         position, own = posed.T_world_camera[:3, 3], self._map.trajectory()
         if not self._state.lost_in_a_row and self._is_near(posed.T_world_camera, attempt):
             return True
@@ -733,25 +821,38 @@ class Tracker:
         The first segment begins at the start pose, with a frame of at least ``min_inliers`` features with
         depth.  A later one begins at the last accepted pose, with a frame of at least three times as many
         features with depth, once more than ``segment_after`` such frames without a pose came since then.
+        Where wheels have carried the pose, it begins there, and earlier; frames whose queries nobody has
+        answered do not count.
         """
         feature_count = int(np.isfinite(view.features.points_camera[:, 2]).sum())
         factor = _BEGIN_DEPTHS_FACTOR if self._segments else 1
         if feature_count < factor * self.options.min_inliers:
             return self._lose(match_count)
+        T_carried, motion = self._carry()
         if self._segments:
-            self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
-            if self._state.unrecognised <= self.options.segment_after:
+            if motion is not None and self._has_missing_answer:
                 return self._lose(match_count)
-        start = self._state.T_world_camera if self._segments else self._T_world_start
-        return self._begin_segment(view, start, feature_count)
+            self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
+            after = self.options.segment_after
+            if self._state.unrecognised <= (after if motion is None else carried_segment_after(after)):
+                return self._lose(match_count)
+        is_continued = bool(self._segments) or motion is not None
+        start = T_carried if is_continued else self._T_world_start
+        return self._begin_segment(view, start, feature_count, is_carried=motion is not None)
 
-    def _begin_segment(self, view: View, T_world_camera: Array, feature_count: int) -> TrackedFrame:
+    def _begin_segment(
+        self, view: View, T_world_camera: Array, feature_count: int, *, is_carried: bool
+    ) -> TrackedFrame:
         """Begin a segment with a frame at a pose; it is the present segment from now on.
 
-        *feature_count* is the number of features with depth.  Returned is the result of the frame.
+        *feature_count* is the number of features with depth, *is_carried* whether the wheels have carried the
+        pose from the segment before.  Returned is the result of the frame.
         """
         segment, timestamp_s = self._next_segment, self._frame.timestamp_s
         self._next_segment += 1
+        if is_carried and self._segments:
+            self._anchors[segment] = self._state.segment
+        self._has_pose = True
         self._segments[segment] = KeyframeMap(self.options.max_keyframes)
         self._state = _TrackState(T_world_camera=T_world_camera, timestamp_s=timestamp_s, segment=segment)
         posed = PosedView(
@@ -798,7 +899,7 @@ class Tracker:
         )
 
     def _make_result(self, posed: PosedView, *, is_keyframe: bool) -> TrackedFrame:
-        is_joined = self._state.segment == min(self._segments)
+        is_joined = root_of(self._anchors, self._state.segment) == min(self._segments)
         return TrackedFrame(
             frame=self._frame,
             T_world_camera=self._state.T_world_camera,
@@ -874,6 +975,7 @@ class Tracker:
         segment_map.move(T_into_segment)
         first_landmark = self._segments[into].append(segment_map)
         self.joins.append(Join(segment, into, T_into_segment))
+        self._anchors = without_segment(self._anchors, segment)
         if segment == self._state.segment and self._state.last is not None:
             self._state = replace(self._state, segment=into)
             self._move_state(T_into_segment, first_landmark)
