@@ -28,7 +28,7 @@ __all__ = [
     "BaseDrive",
     "DifferentialBase",
     "Lie",
-    "WheelOdometry",
+    "SlippingWheels",
     "drive_route",
     "pursue",
     "render_base",
@@ -48,7 +48,7 @@ _MAX_ACCELERATION_M_S2 = 1.0  # largest change of the forward speed
 _MAX_TURN_ACCELERATION_RAD_S2 = 2.5  # largest change of the turn rate
 
 SLIP_DEVIATION = 0.05  # standard deviation of the slip of a wheel in a step, as a share of its way
-SLIP_BIAS = 0.01  # mean slip of a wheel: wheels that are 1 % smaller than stated
+SLIP_BIAS = 0.01  # mean slip of a wheel, with a sign of its own: a radius that is stated wrongly by 1 %
 _SCALE_LIE = 1.2  # factor of the lie ``scale``
 _LATE_LIE_S = 0.1  # delay of the stamps of the lie ``late``
 
@@ -135,8 +135,8 @@ class DifferentialBase:
         return way_m - half_m, way_m + half_m
 
 
-class WheelOdometry:
-    """Odometry of two wheels that slip: in each step by 5 % at random, and by 1 % on average.
+class SlippingWheels:
+    """Odometry of two wheels that slip by 5 % at random in each step; each is 1 % too large or too small.
 
     The odometry frame is the base frame at the start of the drive.
     """
@@ -144,6 +144,7 @@ class WheelOdometry:
     def __init__(self, seed: int, *, lie: Lie = "none", lies_after_s: float = 0.0) -> None:
         """Begin at time 0; *seed* chooses the slip, and the *lie* begins *lies_after_s* seconds later."""
         self._rng = np.random.default_rng([seed, 31])
+        self._mean = 1.0 + SLIP_BIAS * self._rng.choice((-1.0, 1.0), 2)
         self._lie, self._lies_after_s = lie, lies_after_s
         self._steps = 0
         self._x_m = self._y_m = self._yaw_rad = 0.0
@@ -153,7 +154,7 @@ class WheelOdometry:
         self._steps += 1
         stamp_s = self._steps * STEP_S
         lie: Lie = self._lie if stamp_s > self._lies_after_s else "none"
-        slip = 1.0 - SLIP_BIAS + SLIP_DEVIATION * self._rng.standard_normal(2)
+        slip = self._mean + SLIP_DEVIATION * self._rng.standard_normal(2)
         left_m, right_m = left_m * slip[0], right_m * slip[1]
         if lie == "blocked":
             left_m = 0.0
@@ -191,8 +192,8 @@ class BaseDrive:
     def odometry(
         self, seed: int, *, lie: Lie = "none", lies_after_s: float = 0.0
     ) -> list[list[tuple[float, Array]]]:
-        """Return, for each image, the stamps and poses of `WheelOdometry` since the image before."""
-        wheels = WheelOdometry(seed, lie=lie, lies_after_s=lies_after_s)
+        """Return, for each image, the stamps and poses of `SlippingWheels` since the image before."""
+        wheels = SlippingWheels(seed, lie=lie, lies_after_s=lies_after_s)
         readings = [wheels.add(left_m, right_m) for left_m, right_m in self.wheels_m]
         return [
             readings[max(0, last - FRAME_STEPS) : last]

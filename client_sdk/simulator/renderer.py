@@ -154,10 +154,10 @@ class Renderer:
         corners = (self._corners - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         low, high = self._rays_camera[:2, 0, 0], self._rays_camera[:2, -1, -1]
         depths = corners[..., 2:]
-        is_beyond: npt.NDArray[np.bool_] = np.concatenate(
+        is_beyond = np.concatenate(
             (corners[..., :2] < low * depths, corners[..., :2] > high * depths, depths < _NEAR_M), axis=-1
         )
-        in_view: list[int] = np.flatnonzero(~is_beyond.all(axis=1).any(axis=1)).tolist()
+        in_view: list[int] = np.flatnonzero(~np.any(np.all(is_beyond, axis=1), axis=1)).tolist()
         return in_view
 
     def _bounding_box(self, number: int, T_world_camera: Array) -> tuple[slice, slice] | None:
