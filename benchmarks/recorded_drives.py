@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
 from client_sdk.point_map import MapOptions, PointMap
@@ -20,7 +21,7 @@ from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 
 RED_KITCHEN = "7scenes_redkitchen"
 
@@ -95,21 +96,32 @@ def truth_of(dataset: Dataset, stamps_s: Sequence[float]) -> Array:
     return np.asarray(dataset.truth.T_world_camera)[nearest]
 
 
+def solved(query: PoseQuery) -> PnpSolution:
+    """Return the pose of a query as the platform solves it; raises PnpError without a pose."""
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    matches = query.correspondences
+    solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
+    if not matches.depths_m.any():
+        return solution
+    return refine_with_depth(solution, matches.points_world, matches.pixels, matches.depths_m, query.camera)
+
+
+async def answer(query: PoseQuery) -> PoseAnswer:
+    """Answer a pose query of a mapper as the platform does; raises PnpError without a pose."""
+    return PoseAnswer(
+        solution=solved(query), source="robot", server="", round_trip_ms=0.0, queue_ms=0.0, compute_ms=0.0
+    )
+
+
 def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
     """Return ``T_camera_world`` of a query, its inliers, and whether it is weak, as the platform does.
 
     Without a pose they are None, 0 and False.
     """
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    matches = query.correspondences
     try:
-        solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
+        solution = solved(query)
     except PnpError:
         return None, 0, False
-    if matches.depths_m.any():
-        solution = refine_with_depth(
-            solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
-        )
     return solution.T_camera_world, len(solution.inliers), solution.verdict == "weak"
 
 

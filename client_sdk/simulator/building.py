@@ -47,16 +47,16 @@ _PLANS = {
         #aaBaaa#bbbbbb#cccBcccc#
         #aaaaaa#bbSbbb#cccccccc#
         ####a######b######c#####
-        #dddddddddddddddddddddd#
-        #dddddddddddddddddddddd#
+        #ddddddjjjjjkkkkkklllll#
+        #ddddddjjjjjkkkkkklllll#
         #ee##################ff#
         #ee#gggggSg#hhhhBhh##ff#
         #ee#ggggggg#hhhhhhh##ff#
         #eeggggggBg#hhhhhhhhhff#
         #ee#ggggggg#hhhShhh##ff#
         #ee##################ff#
-        #iiiiiiiiiiiiiiiiiiiiii#
-        #iiiiiiiiiiiiiiiiiiiiii#
+        #iiiiiimmmmmnnnnnnooooo#
+        #iiiiiimmmmmnnnnnnooooo#
         ########################""",
     "rooms": """
         ###################
@@ -80,20 +80,20 @@ _PLANS = {
         ###################""",
     "hall": """
         ######################
-        #aaaaaaaaaabbbbbbbbbb#
-        #aaaaaaaaaabbbbbbbbbb#
-        #aaSSSSSSaabbSSSSSSbb#
-        #aaaaaaaaaabbbbbbbbbb#
-        #aaaaaaaaaabbbbbbbbbb#
-        #aaSSSBaaaabbSSSSSSbb#
-        #aaaaaaaaaabbbbbbbbbb#
-        #ccccccccccdddddddddd#
-        #ccSSSSSSccdddBSSSSdd#
-        #ccccccccccdddddddddd#
-        #ccccccccccdddddddddd#
-        #ccSSSSSSccddSSSSSSdd#
-        #ccccccccccdddddddddd#
-        #ccccccccccdddddddddd#
+        #aaaaabbbbbcccccddddd#
+        #aaaaabbbbbcccccddddd#
+        #aaSSSSSSbbccSSSSSSdd#
+        #aaaaabbbbbcccccddddd#
+        #aaaaabbbbbcccccddddd#
+        #eeSSSBffffggSSSSSShh#
+        #eeeeefffffggggghhhhh#
+        #eeeeefffffggggghhhhh#
+        #eeSSSSSSffgggBSSSShh#
+        #eeeeefffffggggghhhhh#
+        #iiiiijjjjjkkkkklllll#
+        #iiSSSSSSjjkkSSSSSSll#
+        #iiiiijjjjjkkkkklllll#
+        #iiiiijjjjjkkkkklllll#
         ######################""",
 }
 BUILDINGS = tuple(_PLANS)
@@ -102,14 +102,16 @@ BUILDINGS = tuple(_PLANS)
 _WALL = "#"
 _SHELF, _SHELF_HEIGHT_M = "S", 1.9
 _BOX, _BOX_HEIGHT_M = "B", 0.8
-_WALL_TEXEL_M = 0.004  # width of a texel of wallpapers: the texture of 1024 texels repeats after 4.1 m
-_FLOOR_TEXEL_M = 0.006  # width of a texel of floors, which repeat after 6.1 m: more than a room
+_FLOOR_TEXEL_M = 0.0055
+"""Width of a texel of floors, whose textures repeat after 5.6 m; most rooms are at most that long, because a
+floor that repeats in view gives false places."""
+_WALL_TEXEL_M = 0.004  # width of a texel of wallpapers: fine enough for a camera at 0.5 m from a wall
 _CEILING_TEXEL_M = 0.005  # width of a texel of ceilings
 _BOOKS_TEXELS = 512  # side of the texture of a shelf, which is as high as the shelf
 _POSTER_TEXELS = 256  # side of the texture of a poster
 _POSTER_M = 0.8  # side of a poster on a wall
 _POSTER_LOW_M = (0.3, 1.2)  # lowest and highest lower edge of a poster: a camera near the floor sees it
-_POSTER_EVERY_M = 3.0  # length of wall for each poster, so that two stretches of one wallpaper differ
+_POSTER_EVERY_M = 2.0  # length of wall for each poster, so that two stretches of one wallpaper differ
 _POSTER_OFFSET_M = 0.01  # distance of a poster from its wall
 _PATH_STEP_M = 0.01  # distance between two points of a route
 _ROUNDING_POINTS = 30
@@ -236,7 +238,7 @@ def _has_letter(plan: npt.NDArray[np.str_], letter: str, axis: int, line: int, f
 def _add_posters(
     builder: WorldBuilder, wall: tuple[int, float, int], extent: tuple[float, float], lamp: int
 ) -> None:
-    """Add posters at random places of a wall (axis, offset, sign as in `Face`), one for each 3 m."""
+    """Add posters at random places of a wall (axis, offset, sign as in `Face`), one for each 2 m."""
     axis, offset, sign = wall
     count = int((extent[1] - extent[0]) / _POSTER_EVERY_M)
     for part in np.linspace(*extent, count, endpoint=False):

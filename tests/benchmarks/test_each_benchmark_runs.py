@@ -25,6 +25,10 @@ RUNS = {
     "hostile.one_tenant": (["--pairs", "1", "--seconds", "3", "--only", "leave"], "leave.p99_ms.pose.0"),
     "hostile.tenants": (["--commands", "300"], "commands.acme"),
     "live.one_process": (["growth", "--keyframes", "300"], "wide.keyframes"),
+    "maps.wheels": (
+        ["--drives", "1", "--covers", "1", "--repeats", "1", "--length-m", "8"],
+        "drives.rows.office 0.frames",
+    ),
     "server.capacity": (
         ["--workers", "1", "--connected", "100", "--seconds", "0.5", "--search-s", "1"],
         "connected.kib_per_robot",
