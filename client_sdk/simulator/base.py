@@ -38,7 +38,7 @@ __all__ = [
 STEP_S = 0.04  # seconds of a step of the simulation: wheel odometry of 25 Hz
 FRAME_STEPS = 5  # steps from one image to the next: 5 Hz
 BASE_CAMERA = Camera(fx=200.0, fy=200.0, cx=159.5, cy=119.5, width=320, height=240)
-"""Intrinsics of the camera on the base, which sees 77 degrees: a robot that turns before a wall sees past it."""
+"""Intrinsics of the camera on the base, which sees 77 degrees: it sees past a wall before which it turns."""
 
 SEPARATION_M = 0.35  # distance of the two wheels, that of a small service robot
 RADIUS_M = 0.22  # radius of the base: a wall that is nearer stops it

@@ -26,7 +26,7 @@ RUNS = {
     "hostile.tenants": (["--commands", "300"], "commands.acme"),
     "live.one_process": (["growth", "--keyframes", "300"], "wide.keyframes"),
     "maps.wheels": (
-        ["--drives", "1", "--covers", "1", "--repeats", "1", "--length-m", "8"],
+        ["--only", "drives", "covers", "--drives", "1", "--covers", "1", "--length-m", "6"],
         "drives.rows.office 0.frames",
     ),
     "server.capacity": (
