@@ -242,7 +242,11 @@ def run_drives(numbers: Sequence[int], length_m: float, only: Sequence[str]) -> 
         if has_cpu:
             say(figures.setdefault("cpu", cpu_of(drive)))
     if rows:
-        figures["drives"] = {"rows": rows, "median_ratio_to_camera": median_of(rows, "ratio_to_camera")}
+        figures["drives"] = {
+            "rows": rows,
+            "median_ratio_to_camera": median_of(rows, "ratio_to_camera"),
+            "false_alarms": sum(bool(row["trouble"]) for row in rows.values()),
+        }
     if lies:
         figures["lies"] = lies
     return figures
@@ -428,6 +432,7 @@ async def _cpu_of(drive: Drive) -> dict[str, Any]:
     Bar("drives.median_ratio_to_camera", at_most=1.0),
     Bar("drives.rows.*.ratio_to_camera", at_most=1.2),
     Bar("drives.rows.*.ratio_to_wheels", at_most=0.2),
+    Bar("drives.false_alarms", at_most=0, unit="drives"),
     Bar("lies.*.named_s", at_most=5.0, unit="s"),
     Bar("lies.*.ratio_to_camera", at_most=1.05),
     Bar("covers.rms_ratio_to_wheels", at_most=1.2),
