@@ -36,13 +36,11 @@ one blocked wheel gives 1 at a track of 1 m, and more at a smaller one."""
 _MAX_TURN_SHARE = 0.15  # in addition: largest difference of the rotations, as a share of the rotation
 _MAX_TURN_RAD = 0.05  # in addition: largest difference of the rotations, in rad
 _SHIFTS_S: Array = np.linspace(-0.2, 0.2, 21)  # times, in seconds, by which stamps are tried to be late
-_MAX_SHIFT_S = (
-    0.06  # largest time, in seconds, by which the stamps may be late: drivers are late by 20 to 50 ms
-)
+_MAX_SHIFT_S = 0.07  # largest time, in seconds, by which stamps may be late; drivers are by 20 to 50 ms
 _SHIFT_CLEARNESS = 25.0
-"""By how many times the variance of a heading the sum of squares must fall for another time: five standard
-deviations."""
-_SHIFT_SPAN_S = 8.0  # newest time, in seconds, whose headings are compared: two or more turns
+"""By how many times the variance of a rotation the sum of squares must fall for another time: five standard
+deviations, because it is asked in each window of a drive."""
+_SHIFT_SPAN_S = 10.0  # newest time, in seconds, whose headings are compared: begin and end of a turn
 _MIN_HEADINGS = 15  # fewest differences of headings that are compared
 
 
@@ -85,34 +83,38 @@ class WheelCheck:
         self._agreeing = 0
         self._windows: deque[_Window] = deque(maxlen=_WINDOWS)
         self._poses: list[tuple[float, Array]] = []
-        self._headings: deque[tuple[float, float, float]] = deque()
-        """Times of two successive frames in seconds, and the rotation between them in rad."""
+        self._headings: deque[tuple[float, float]] = deque()
+        """Time in seconds and heading in rad, without a wrap at half a turn, of the newest frames."""
         self._world: object = None
 
     def add(self, timestamp_s: float, T_world_base: Array, world: object) -> bool:
         """Add the tracked pose of a frame; return whether it ends a window, for `close`."""
         if world != self._world or (self._poses and timestamp_s - self._poses[-1][0] > _MAX_WINDOW_S):
             self._poses.clear()
+            self._headings.clear()
         self._world = world
+        heading_rad = 0.0
         if self._poses:
-            last_s, last = self._poses[-1]
-            self._headings.append((last_s, timestamp_s, _yaw(inverse(last) @ T_world_base)))
-            while timestamp_s - self._headings[0][0] > _SHIFT_SPAN_S:
-                self._headings.popleft()
+            heading_rad = self._headings[-1][1] + _yaw(inverse(self._poses[-1][1]) @ T_world_base)
+        self._headings.append((timestamp_s, heading_rad))
+        while timestamp_s - self._headings[0][0] > _SHIFT_SPAN_S:
+            self._headings.popleft()
         self._poses.append((timestamp_s, T_world_base))
         self.window_s = self._poses[0][0], timestamp_s
         return timestamp_s - self._poses[0][0] >= _WINDOW_S
 
-    def close(self, T_begin_end: Array, stamps_s: Array, headings_rad: Array) -> None:
+    def close(self, T_begin_end: Array | None, stamps_s: Array, headings_rad: Array) -> None:
         """Compare the window that `add` has ended, and set `trouble`.
 
         Args:
-            T_begin_end: ``(4, 4)``, motion of the base in the window by the wheels.
+            T_begin_end: ``(4, 4)``, motion of the base in the window by the wheels; None if not known.
             stamps_s: ``(n,)`` times of all readings, in seconds.
             headings_rad: ``(n,)`` their headings, without a wrap at half a turn.
         """
         camera = inverse(self._poses[0][1]) @ self._poses[-1][1]
         del self._poses[:-1]
+        if T_begin_end is None:
+            return
         window = _Window(
             camera_m=float(np.linalg.norm(camera[:3, 3])),
             wheels_m=float(np.linalg.norm(T_begin_end[:3, 3])),
@@ -138,18 +140,22 @@ class WheelCheck:
             self.trouble = fault or self.trouble
 
     def _find_shift(self, stamps_s: Array, headings_rad: Array) -> float:
-        """Return by how many seconds the wheels are late; 0 while it is not clear, or little."""
-        steps = np.array(self._headings).reshape(-1, 3)
-        steps = steps[steps[:, 1] + _SHIFTS_S[-1] <= stamps_s[-1]]
-        if len(steps) < _MIN_HEADINGS:
+        """Return by how many seconds the wheels are late; 0 while it is not clear, or little.
+
+        The headings of the camera are moved in time, because they have little noise: where the robot drives
+        straight, no time fits better than another one.
+        """
+        times_s, camera_rad = np.array(self._headings).T
+        inner_s = times_s[(times_s >= times_s[0] + _SHIFTS_S[-1]) & (times_s <= times_s[-1] + _SHIFTS_S[0])]
+        inner_s = inner_s[inner_s <= stamps_s[-1]]
+        if len(inner_s) <= _MIN_HEADINGS:
             return 0.0
-        begin, end = (
-            np.interp(steps[:, column] + _SHIFTS_S[:, None], stamps_s, headings_rad) for column in (0, 1)
-        )
-        squares = np.square(end - begin - steps[:, 2]).sum(axis=1)
+        wheels_rad = np.diff(np.interp(inner_s, stamps_s, headings_rad))
+        moved_rad = np.diff(np.interp(inner_s - _SHIFTS_S[:, None], times_s, camera_rad), axis=1)
+        squares = np.square(wheels_rad - moved_rad).sum(axis=1)
         best = int(np.argmin(squares))
         fall = squares[len(_SHIFTS_S) // 2] - squares[best]
-        is_clear = fall > _SHIFT_CLEARNESS * squares[best] / len(steps)
+        is_clear = fall > _SHIFT_CLEARNESS * squares[best] / len(wheels_rad)
         return float(_SHIFTS_S[best]) if is_clear and abs(_SHIFTS_S[best]) > _MAX_SHIFT_S else 0.0
 
 

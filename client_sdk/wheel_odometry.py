@@ -238,9 +238,8 @@ class WheelOdometry:
         if not check.add(timestamp_s, T_world_base, world):
             return
         motion = self._measure(*check.window_s)
-        if motion is not None:
-            headings = self._stamps_s[: self._count], self._paths[: self._count, 2]
-            check.close(motion.T_begin_end, *headings)
+        headings = self._stamps_s[: self._count], self._paths[: self._count, 2]
+        check.close(None if motion is None else motion.T_begin_end, *headings)
 
     def camera_position(self, timestamp_s: float) -> Array | None:
         """Return the ``(3,)`` position of the camera in the frame of the readings; None if unknown."""
