@@ -15,28 +15,37 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper
 from client_sdk.robot import Robot
+from client_sdk.wheel_odometry import OdometryReading
 from ros_bridge.access import connect_robot
-from ros_bridge.incoming import IncomingFrames, PairedImages, Role
+from ros_bridge.base_poses import BasePoses
+from ros_bridge.frame_tree import Transform
+from ros_bridge.incoming import TOO_FAST, IncomingFrames, PairedImages, Role, kind_of
 from ros_bridge.map_services import MapServices, as_json
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
+from ros_bridge.robot_frames import RobotFrames
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
+from rse_pf.slam.occupancy import GridOptions
 from rse_pf.terminal import show
 
-__all__ = ["Bridge", "CallReply", "Publish", "connected_bridge"]
+__all__ = ["Bridge", "CallReply", "OpenMapper", "Publish", "connected_bridge"]
 
 Publish = Callable[[Message], None]
 """Publishes a message; called from the bridge's event loop, so it must not wait."""
+OpenMapper = Callable[[Array | None], contextlib.AbstractAsyncContextManager[Mapper | LiveMapper]]
+"""Opens the mapper for a mount ``T_base_camera`` ``(4, 4)`` of the camera; None if the mount is not known."""
+PoseStatus = Literal["visual", "odometry", "lost"]
 
 # Time between two status messages, in seconds.
 _DIAGNOSTICS_EVERY_S = 1.0
@@ -48,6 +57,22 @@ _LEAST_READINGS = 2
 _CALL_S = 10.0
 # A frame that is earlier than the last one by more than this, in seconds, comes from a restarted source.
 _CLOCK_RESTART_S = 1.0
+# Time between two transforms from map to odometry frame, in seconds: 10 Hz, at which Nav2's AMCL works.
+_MAP_ODOM_EVERY_S = 0.1
+# Longest wait for the static transforms from base to camera, in seconds: a latched topic comes at once.
+_MOUNT_WAIT_S = 2.0
+# Longest time without a processed image, in seconds, for which the pose counts as visual.
+_STALE_S = 2.0
+# Longest time without a reading, in seconds, for which odometry counts as alive.
+_ODOMETRY_STALE_S = 1.0
+# Time without a pose, in seconds, after which the level of the status message is error.
+_LOST_ERROR_S = 5.0
+# Largest difference of ROS clock and time stamp of an image, in ns: above it, images have another clock.
+_OTHER_CLOCK_NS = 10_000_000_000
+# Time before the first image from which odometry is given to the mapper, in ns: it needs a reading before.
+_FIRST_ODOMETRY_NS = 1_000_000_000
+# Levels of ``diagnostic_msgs/DiagnosticStatus``.
+_OK, _WARNING, _ERROR = 0, 1, 2
 _IDENTITY = np.eye(4)
 
 
@@ -66,47 +91,70 @@ class Bridge:
 
     def __init__(
         self,
-        mapper: Mapper | LiveMapper,
+        open_mapper: OpenMapper,
         options: BridgeOptions,
         publish: Publish,
         *,
         is_ros1: bool,
         robot: Robot | None = None,
         clock: Callable[[], float] = time.monotonic,
+        now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Describe a bridge.
 
         Args:
-            mapper: The mapper of a connected robot.
+            open_mapper: Opens the mapper of a connected robot, when the mount of the camera is known.
             options: The options of the bridge.
             publish: Called with each message to publish.
             is_ros1: Whether messages are encoded as in ROS 1; otherwise as CDR, as in ROS 2.
             robot: The robot with which ROS services call the platform; None lets those services fail.
             clock: Returns seconds, monotonic; for the intervals between clouds and paths.
+            now_ns: Returns the time of ROS in nanoseconds, for the transform from map to odometry frame.
         """
-        maker = MessageMaker(is_ros1=is_ros1)
+        self._maker = maker = MessageMaker(is_ros1=is_ros1)
         self.frames = 0
         self.lost_frames = 0
         self.track_s: list[float] = []
-        self._mapper, self._options, self._publish, self._robot = mapper, options, publish, robot
-        self._incoming = IncomingFrames(maker, options)
-        self._outgoing = OutgoingMessages(maker, options)
-        self._clock = clock
+        self._options, self._publish, self._robot = options, publish, robot
+        self._open_mapper = open_mapper
+        self._mapper: Mapper | LiveMapper | None = None
+        self._stack = contextlib.AsyncExitStack()
+        self._incoming = IncomingFrames(maker, options, self._why_full)
+        self._frames = RobotFrames(options)
+        self._poses = BasePoses(self._frames, options.max_correction_m_s)
+        self._outgoing = OutgoingMessages(maker, options, self._frames)
+        self._clock, self._now_ns = clock, now_ns
         self._loop = asyncio.get_running_loop()
-        self._has_frame = asyncio.Event()
-        self._due = {"cloud": clock() + options.cloud_every_s, "path": clock()}
+        self._has_frame, self._has_static = asyncio.Event(), asyncio.Event()
+        self._started_s = clock()
+        self._due = {
+            "cloud": clock() + options.cloud_every_s,
+            "path": clock(),
+            "floor plan": clock() + options.floor_plan_every_s,
+        }
         self._stamp_ns = 0
         self._last_s = float("-inf")
         self._reason = ""
         self._cloud: asyncio.Task[None] | None = None
-        self._maps = None if robot is None else MapServices(robot, mapper, options)
+        self._plan: asyncio.Task[None] | None = None
+        self._plan_trouble = ""
+        self._maps: MapServices | None = None
         self._seen: Camera | None = None
-        self._publishes_imu = bool(options.imu) and options.publish_odom
+        self._statics: list[Transform] = []
+        self._awaits_imu_frame = bool(options.imu)
+        self._tracking_since_s: float | None = None
+        self._fed_ns: int | None = None
+        self._status: PoseStatus | None = None
+        self._frame_status: PoseStatus = "lost"
+        self._frame_s = self._lost_since_s = clock()
+        self._odometry_seen: tuple[int | None, float] = (None, float("-inf"))
+        self._uses_ros_clock = True
+        self._map_odom_ns = 0
+        self._printed: set[str] = set()
 
-    def close(self) -> None:
-        """Close the connection to the data service, if a service of maps has opened one."""
-        if self._maps is not None:
-            self._maps.close()
+    async def close(self) -> None:
+        """Leave the live map, and close the connection to the data service, if they are open."""
+        await self._stack.aclose()
 
     @property
     def triggers(self) -> dict[str, Callable[[], Coroutine[Any, Any, CallReply]]]:
@@ -120,9 +168,28 @@ class Bridge:
 
     def receive(self, role: Role, data: bytes | memoryview) -> None:
         """Store the bytes of a message of the topic *role*; never waits and raises no error."""
-        if self._incoming.add(role, data):
-            with contextlib.suppress(RuntimeError):  # the event loop is closed: the bridge has stopped
-                self._loop.call_soon_threadsafe(self._has_frame.set)
+        if role in ("odometry", "tf", "tf_static"):
+            self._receive_frames(role, data)
+        elif self._incoming.add(role, data):
+            self._set(self._has_frame)
+
+    def _receive_frames(self, role: Role, data: bytes | memoryview) -> None:
+        if role == "tf" and not self._frames.concerns(data):
+            return
+        try:
+            message = self._maker.decode(kind_of(role, ""), data)
+            if role == "odometry":
+                self._frames.add_odometry(message)
+            else:
+                self._frames.add_transforms(message, is_static=role == "tf_static")
+        except BrokenMessage as error:
+            self._incoming.check.refuse("broken", f"a message of {role} cannot be used: {error}")
+        if role == "tf_static":
+            self._set(self._has_static)
+
+    def _set(self, event: asyncio.Event) -> None:
+        with contextlib.suppress(RuntimeError):  # the event loop is closed: the bridge has stopped
+            self._loop.call_soon_threadsafe(event.set)
 
     async def run(self) -> None:
         """Track frames and publish the results, until cancelled.
@@ -130,13 +197,14 @@ class Bridge:
         Raises:
             RsePfError: The robot has stopped reconnecting: its token expired, or another robot uses its name.
         """
-        running = [asyncio.create_task(self._take()), asyncio.create_task(self._report())]
+        works = self._take(), self._report(), self._repeat_transform()
+        running = [asyncio.create_task(work) for work in works]
         try:
             done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         finally:
-            ending = [*running, *([self._cloud] if self._cloud is not None else [])]
+            ending = [*running, *(task for task in (self._cloud, self._plan) if task is not None)]
             for task in ending:
                 task.cancel()
             await asyncio.gather(*ending, return_exceptions=True)
@@ -148,6 +216,8 @@ class Bridge:
         """
         if not self._options.out:
             return CallReply(ok=False, code="usage", message="no folder: set the parameter out")
+        if self._mapper is None:
+            return CallReply(ok=False, code="usage", message="there is no image yet: wait for a pose")
         try:
             report = await asyncio.to_thread(self._mapper.save, Path(self._options.out))
         except RsePfError as error:
@@ -169,8 +239,10 @@ class Bridge:
             return CallReply(ok=False, code=error.code, message=error.message)
 
     async def _of_maps(self, ask: Callable[[MapServices], Awaitable[Any]]) -> CallReply:
-        if self._maps is None:
+        if self._robot is None:
             return CallReply(ok=False, code="disconnected", message="this bridge has no connection")
+        if self._maps is None:
+            return CallReply(ok=False, code="usage", message="there is no image yet: wait for a pose")
         try:
             return CallReply(ok=True, reply=as_json(await ask(self._maps)))
         except RsePfError as error:
@@ -189,66 +261,196 @@ class Bridge:
         frame = await asyncio.to_thread(self._incoming.decode, images)
         if frame is None:
             return
+        mapper = self._mapper or await self._begin(images)
+        self._uses_ros_clock = abs(self._now_ns() - images.stamp_ns) <= _OTHER_CLOCK_NS
         started, self._seen = time.perf_counter(), frame.camera
         try:
-            tracked = await self._track(frame)
+            tracked = await self._track(mapper, frame, images.stamp_ns)
         except UsageError as error:
             self._incoming.check.refuse("not tracked", error.message)
             return
         self.track_s.append(time.perf_counter() - started)
         del self.track_s[:-10_000]
         self.frames += 1
-        self._stamp_ns = images.stamp_ns
-        self._reason = tracked.reason if tracked.lost else ""
-        self.lost_frames += tracked.lost
-        T_map_odom, alignment = self._alignment()
-        for message in self._outgoing.of_frame(
-            tracked, images.stamp_ns, images.camera_frame, T_map_odom=T_map_odom, alignment=alignment
-        ):
-            self._publish(message)
+        self._stamp_ns, self._frame_s = images.stamp_ns, self._clock()
+        is_visual = tracked.pose_source == "visual"
+        self._reason = "" if is_visual else tracked.reason
+        self.lost_frames += not is_visual
+        self._publish_poses(mapper, tracked, images.stamp_ns)
         self._publish_imu_pose(images)
-        now = self._clock()
+        self._publish_map(mapper, images.stamp_ns)
+
+    async def _begin(self, images: PairedImages) -> Mapper | LiveMapper:
+        """Find the mount of the camera, open the mapper, and publish the mount if no other node does."""
+        rig, base = self._incoming.rig, self._options.own_base_frame
+        T_base_left = self._frames.mount(images.camera_frame)
+        while base and T_base_left is None:
+            left_s = self._started_s + _MOUNT_WAIT_S - self._clock()
+            self._has_static.clear()
+            T_base_left = self._frames.mount(images.camera_frame)
+            if T_base_left is None:
+                try:
+                    await asyncio.wait_for(self._has_static.wait(), left_s)
+                except asyncio.TimeoutError:
+                    T_base_left = rig.T_base_left
+                    break
+        T_base_camera = None if T_base_left is None else T_base_left @ rig.T_left_rectified
+        self._frames.settle(images.camera_frame, T_base_camera)
+        if T_base_left is not None:
+            self._add_static(
+                self._frames.static_transform(images.stamp_ns, base, images.camera_frame, T_base_left)
+            )
+        self._print_once(self._frames.missing_mount)
+        mapper = await self._stack.enter_async_context(self._open_mapper(T_base_camera))
+        if self._robot is not None:
+            self._maps = MapServices(self._robot, mapper, self._options)
+            self._stack.callback(self._maps.close)
+        self._mapper = mapper
+        return mapper
+
+    async def _track(self, mapper: Mapper | LiveMapper, frame: Frame, stamp_ns: int) -> TrackedFrame:
+        back_s = self._last_s - frame.timestamp_s
+        if back_s > _CLOCK_RESTART_S:
+            show(f"the time of the images went back by {back_s:.1f} s, as if a bag is played again")
+            mapper.restart_clock()
+            self._poses.restart_clock()
+            self._fed_ns = None
+        after_ns = stamp_ns - _FIRST_ODOMETRY_NS if self._fed_ns is None else self._fed_ns
+        poses = [] if self._frames.T_base_camera is None else self._frames.readings(after_ns, stamp_ns)
+        readings = [OdometryReading(timestamp_s=ns / 1e9, T_odom_base=T) for ns, T in poses]
+        self._tracking_since_s = self._clock()
+        try:
+            tracked = await mapper.track(frame, odometry=readings)
+        finally:
+            self._tracking_since_s = None
+        self._last_s = frame.timestamp_s
+        self._fed_ns = poses[-1][0] if poses else self._fed_ns
+        return tracked
+
+    def _publish_poses(self, mapper: Mapper | LiveMapper, tracked: TrackedFrame, stamp_ns: int) -> None:
+        T_map_world, alignment = self._alignment(mapper)
+        if tracked.T_new_old is not None:
+            self._outgoing.move_path(tracked.T_new_old)
+        pose = self._poses.add(tracked, stamp_ns, T_map_world, alignment)
+        is_in_map = pose is not None and pose.T_map_base is not None
+        self._frame_status = tracked.pose_source if is_in_map else "lost"
+        self._update_status()
+        if pose is None:
+            return
+        self._outgoing.extend_path(stamp_ns, pose.T_world_base)
+        if not self._frames.is_odometry_foreign and pose.T_odom_base is not None:
+            self._publish_transforms([self._frames.odom_transform(stamp_ns, pose.T_odom_base)])
+        for message in self._outgoing.of_pose(pose, stamp_ns):
+            self._publish(message)
+
+    def _publish_map(self, mapper: Mapper | LiveMapper, stamp_ns: int) -> None:
+        """Publish path and cloud if they are due, and the pose of the mapper's world in the map is known."""
+        now, (T_map_world, _) = self._clock(), self._alignment(mapper)
+        if T_map_world is None:
+            return
         if now >= self._due["path"]:
             self._due["path"] = now + _PATH_EVERY_S
-            for message in self._outgoing.path():
+            for message in self._outgoing.path(T_map_world):
                 self._publish(message)
         if now >= self._due["cloud"] and (self._cloud is None or self._cloud.done()):
             self._due["cloud"] = now + self._options.cloud_every_s
-            self._cloud = asyncio.create_task(self._publish_cloud(images.stamp_ns))
+            self._cloud = asyncio.create_task(self._publish_cloud(mapper, stamp_ns, T_map_world))
+
+        every_s = self._options.floor_plan_every_s
+        is_plan_due = every_s > 0 and now >= self._due["floor plan"]
+        is_plan_done = self._plan is None or self._plan.done()
+        if is_plan_due and is_plan_done and not isinstance(mapper, LiveMapper):
+            self._due["floor plan"] = now + every_s
+            self._plan = asyncio.create_task(self._publish_floor_plan(mapper, stamp_ns))
 
     def _publish_imu_pose(self, images: PairedImages) -> None:
         """Publish the IMU's pose in the camera frame once, when it and the IMU's frame name are known."""
         rig = self._incoming.rig
         T = rig.T_camera_imu
-        if self._publishes_imu and rig.imu_frame and T is not None:
-            self._publishes_imu = False
-            self._publish(self._outgoing.imu_place(images.stamp_ns, images.camera_frame, rig.imu_frame, T))
+        if self._awaits_imu_frame and rig.imu_frame and T is not None:
+            self._awaits_imu_frame = False
+            self._add_static(
+                self._frames.static_transform(images.stamp_ns, images.camera_frame, rig.imu_frame, T)
+            )
 
-    async def _track(self, frame: Frame) -> TrackedFrame:
-        back_s = self._last_s - frame.timestamp_s
-        if back_s > _CLOCK_RESTART_S:
-            show(f"the time of the images went back by {back_s:.1f} s, as if a bag is played again")
-            self._mapper.restart_clock()
-        tracked = await self._mapper.track(frame)
-        self._last_s = frame.timestamp_s
-        return tracked
+    def _add_static(self, transform: Transform | None) -> None:
+        """Publish *transform* with the earlier ones: a late subscriber receives only the last message."""
+        if transform is not None:
+            self._statics.append(transform)
+            for message in self._outgoing.transforms(self._statics, is_static=True):
+                self._publish(message)
 
-    def _alignment(self) -> tuple[Array | None, Array | None]:
-        """Return the pose ``(4, 4)`` of the odometry frame in the map and its covariance ``(6, 6)``.
+    def _publish_transforms(self, transforms: list[Transform]) -> None:
+        for message in self._outgoing.transforms(self._frames.permitted(transforms)):
+            self._publish(message)
+
+    async def _repeat_transform(self) -> None:
+        """Publish the transform from map to odometry frame at 10 Hz, and the status, until cancelled."""
+        last_s = self._clock()
+        while True:
+            elapsed_s = self._clock() - last_s
+            last_s += elapsed_s
+            self._update_status()
+            T_map_odom = self._poses.map_to_odom(elapsed_s) if self._frames.base else None
+            now_ns = self._now_ns() if self._uses_ros_clock else self._stamp_ns
+            stamp_ns = now_ns + round(1e9 * self._options.transform_tolerance_s)
+            if T_map_odom is not None and stamp_ns != self._map_odom_ns:  # tf warns about a repeated stamp
+                self._map_odom_ns = stamp_ns
+                frames = self._frames
+                self._publish_transforms(
+                    [Transform(parent=frames.map, child=frames.odom, stamp_ns=stamp_ns, T=T_map_odom)]
+                )
+            await asyncio.sleep(_MAP_ODOM_EVERY_S)
+
+    def _update_status(self) -> None:
+        """Publish the status of the pose in the map if it has changed."""
+        now, newest_ns = self._clock(), self._frames.newest_odometry_ns
+        if newest_ns != self._odometry_seen[0]:
+            self._odometry_seen = newest_ns, now
+        is_carried = (
+            self._frames.is_odometry_foreign
+            and self._poses.is_odom_known
+            and now - self._odometry_seen[1] <= _ODOMETRY_STALE_S
+        )
+        status: PoseStatus = self._frame_status if now - self._frame_s <= _STALE_S else "lost"
+        if status == "lost" and is_carried:
+            status = "odometry"
+        if status != "lost":
+            self._lost_since_s = now
+        if status != self._status:
+            self._status = status
+            self._publish(self._outgoing.status(status))
+
+    def _alignment(self, mapper: Mapper | LiveMapper) -> tuple[Array | None, Array | None]:
+        """Return the pose ``(4, 4)`` of the mapper's world in the map and its covariance ``(6, 6)``.
 
         Both may be None with a live map.  A robot with a map of its own has the identity and None.
         """
-        if isinstance(self._mapper, LiveMapper):
-            return self._mapper.T_map_odom, self._mapper.covariance
+        if isinstance(mapper, LiveMapper):
+            return mapper.T_map_odom, mapper.covariance
         return _IDENTITY, None
 
-    async def _publish_cloud(self, stamp_ns: int) -> None:
+    async def _publish_cloud(self, mapper: Mapper | LiveMapper, stamp_ns: int, T_map_world: Array) -> None:
         def made() -> list[Message]:
-            least = 1 if isinstance(self._mapper, LiveMapper) else _LEAST_READINGS
-            points, colours = self._mapper.map.points(min_readings=least)
-            return self._outgoing.cloud(stamp_ns, points, colours)
+            least = 1 if isinstance(mapper, LiveMapper) else _LEAST_READINGS
+            points, colours = mapper.map.points(min_readings=least)
+            return self._outgoing.cloud(stamp_ns, T_map_world, points, colours)
 
         for message in await asyncio.to_thread(made):
+            self._publish(message)
+
+    async def _publish_floor_plan(self, mapper: Mapper, stamp_ns: int) -> None:
+        """Publish the floor plan, if the map is level; otherwise the status message says why not."""
+        if self._frames.T_base_camera is None:
+            self._plan_trouble = f"no floor plan: {self._frames.missing_mount or 'there is no base_frame'}"
+            return
+        try:
+            plan = await asyncio.to_thread(mapper.floor_plan, GridOptions(up=(0.0, 0.0, 1.0)))
+        except UsageError as error:
+            self._plan_trouble = f"no floor plan: {error.message}"
+            return
+        self._plan_trouble = ""
+        for message in self._outgoing.floor_plan(stamp_ns, plan):
             self._publish(message)
 
     async def _report(self) -> None:
@@ -260,32 +462,68 @@ class Bridge:
             if cause and cause != logged and not cause.startswith("connection lost"):  # is printed elsewhere
                 show(f"no connection to the platform: {cause}")
             logged = cause
+            mapper, frame_troubles = self._mapper, self._frames.troubles()
+            for trouble in frame_troubles:
+                self._print_once(trouble)
             values = {
                 "frames": str(self.frames),
                 "lost frames": str(self.lost_frames),
-                "scale": self._mapper.scale,
+                "status": self._status or "lost",
+                "base": self._frames.missing_mount or self._frames.base,
+                "scale": "" if mapper is None else mapper.scale,
                 "track ms (median)": f"{1e3 * median(self.track_s):.1f}" if self.track_s else "",
                 "connected": str(connected).lower(),
                 **{f"left out: {why}": str(count) for why, count in sorted(check.left_out.items())},
             }
-            trouble = "" if connected else f"no connection to the platform{cause and f': {cause}'}"
-            trouble = (
-                trouble or check.fault or self._reason or self._silence(received, last) or check.shortage
-            )
-            if isinstance(self._mapper, LiveMapper):
-                values |= {"map": self._mapper.name, "map state": self._mapper.state}
-                values["aligned"] = str(self._mapper.aligned).lower()
-                trouble = trouble or self._mapper.trouble or self._mapper.reason
-            if not trouble and self.frames == last:
-                trouble = f"no new frame of {self._options.named(self._options.colour)}"
+            troubles = [
+                "" if connected else f"no connection to the platform{cause and f': {cause}'}",
+                check.fault,
+                self._reason,
+                self._silence(received, last),
+                check.shortage,
+                self._lateness(last),
+                *frame_troubles,
+                self._frames.missing_mount if self._options.planar or self._options.odometry else "",
+            ]
+            if mapper is not None:
+                troubles += [mapper.odometry_trouble, self._plan_trouble]
+            if isinstance(mapper, LiveMapper):
+                values |= {"map": mapper.name, "map state": mapper.state}
+                values["aligned"] = str(mapper.aligned).lower()
+                troubles += [mapper.trouble, mapper.reason]
+            text = next((trouble for trouble in troubles if trouble), "")
+            lost_s = self._clock() - self._lost_since_s
+            is_working = connected and self.frames > 0 and lost_s <= _LOST_ERROR_S
+            if self.frames and lost_s > _LOST_ERROR_S:
+                text = f"lost for {lost_s:.0f} s{text and f': {text}'}"
+            level = _ERROR if not is_working else _WARNING if text else _OK
             check.next_report()
             last, received = self.frames, Counter(self._incoming.received)
             self._publish(
                 self._outgoing.diagnostics(
-                    self._stamp_ns, trouble=trouble, is_working=connected and self.frames > 0, values=values
+                    self._stamp_ns, level=level, text=text or "poses are given", values=values
                 )
             )
             await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
+
+    def _print_once(self, sentence: str) -> None:
+        if sentence and sentence not in self._printed:
+            self._printed.add(sentence)
+            show(sentence)
+
+    def _why_full(self) -> tuple[str, str]:
+        """Return why an image does not fit into the queue: the key of the count, and the sentence."""
+        if self._robot is not None and not self._robot.connected:
+            return "no connection", "there was no connection to the platform"
+        return TOO_FAST if self._mapper is not None else ("before the start", "the bridge has just started")
+
+    def _lateness(self, frames_before: int) -> str:
+        """Return a sentence if no frame was tracked since the count *frames_before*, else an empty text."""
+        if self.frames != frames_before:
+            return ""
+        if self._tracking_since_s is not None:
+            return f"an image is tracked for {self._clock() - self._tracking_since_s:.1f} s"
+        return f"no new frame of {self._options.named(self._options.colour)}"
 
     def _silence(self, before: Counter[str], frames_before: int) -> str:
         """Return a sentence with the image topics that sent no message since the counts *before*.
@@ -307,23 +545,36 @@ class Bridge:
 
 @contextlib.asynccontextmanager
 async def connected_bridge(
-    options: BridgeOptions, publish: Publish, *, is_ros1: bool
+    options: BridgeOptions,
+    publish: Publish,
+    *,
+    is_ros1: bool,
+    now_ns: Callable[[], int] = time.time_ns,
 ) -> AsyncIterator[Bridge]:
-    """Connect to the platform, join the live map if *options* name one, and yield a bridge.
+    """Connect to the platform, and yield a bridge; close all afterwards.
 
-    Close all afterwards.
+    With the first image, the bridge joins the live map if *options* name one.  *now_ns* returns the time of
+    ROS in nanoseconds.
 
     Raises:
         UsageError: The options have no address, or the token cannot be read.
         RsePfError: The platform rejected the robot.
     """
-    async with connect_robot(options) as robot, contextlib.AsyncExitStack() as stack:
-        mapper: Mapper | LiveMapper
-        if options.map:
-            mapper = await stack.enter_async_context(robot.live_map(options.map, depth=True))
-        else:
-            name = (options.namespace.strip("/") or "robot") if options.publish_as else ""
-            mapper = robot.mapper(depth=options.partner == "depth", keyframes_of=name)
-        bridge = Bridge(mapper, options, publish, is_ros1=is_ros1, robot=robot)
-        stack.callback(bridge.close)
-        yield bridge
+    async with connect_robot(options) as robot:
+
+        @contextlib.asynccontextmanager
+        async def open_mapper(T_base_camera: Array | None) -> AsyncIterator[Mapper | LiveMapper]:
+            if options.map:
+                async with robot.live_map(options.map, depth=True, T_base_camera=T_base_camera) as live:
+                    yield live
+                return
+            keeps_keyframes = options.publish_as or options.floor_plan_every_s
+            name = (options.namespace.strip("/") or "robot") if keeps_keyframes else ""
+            is_deep = options.partner == "depth"
+            yield robot.mapper(depth=is_deep, keyframes_of=name, T_base_camera=T_base_camera)
+
+        bridge = Bridge(open_mapper, options, publish, is_ros1=is_ros1, robot=robot, now_ns=now_ns)
+        try:
+            yield bridge
+        finally:
+            await bridge.close()

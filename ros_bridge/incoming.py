@@ -10,6 +10,7 @@ from __future__ import annotations
 import bisect
 import threading
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,7 +20,7 @@ from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth, format_of
 from client_sdk.bags.lens import lens_of
 from client_sdk.bags.message_maker import MessageMaker
-from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU
+from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU, ODOMETRY, TF
 from client_sdk.cameras.source import make_empty_depth
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import ImageMap, map_to_pinhole
@@ -30,9 +31,10 @@ from ros_bridge.rig_topics import RigTopics
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Camera, Lens
 
-__all__ = ["IncomingFrames", "PairedImages", "Role", "kind_of"]
+__all__ = ["TOO_FAST", "IncomingFrames", "PairedImages", "Role", "kind_of"]
 
-Role = Literal["colour", "depth", "right", "info", "right_info", "imu"]
+Role = Literal["colour", "depth", "right", "info", "right_info", "imu", "odometry", "tf", "tf_static"]
+_FRAME_KINDS = {"odometry": ODOMETRY, "tf": TF, "tf_static": TF}
 # Exceptions that decoding of a malformed message may raise.
 _FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 # A time stamp this far before the last frame, in ns, means that the clock was set back or a bag plays again.
@@ -43,6 +45,8 @@ _MAX_CAMERAS = 10
 _REPEATED = "repeated"
 # The partner of a colour image as text for the user, by role.
 _NAMES = {"depth": "depth", "right": "right image"}
+# Why an image that does not fit into the queue is left out: the key of the count, and the sentence.
+TOO_FAST = ("too fast", "they come faster than they are tracked")
 # Largest number of images of a topic that wait for their partner.
 _WAITING = 30
 
@@ -52,6 +56,8 @@ def kind_of(role: Role, topic: str) -> str:
 
     Images are compressed if the name ends with ``compressed`` or ``compressedDepth``.
     """
+    if role in _FRAME_KINDS:
+        return _FRAME_KINDS[role]
     if role == "imu":
         return IMU
     if role in ("info", "right_info"):
@@ -128,8 +134,24 @@ class IncomingFrames:
     role.
     """
 
-    def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
+    def __init__(
+        self,
+        maker: MessageMaker,
+        options: BridgeOptions,
+        why_full: Callable[[], tuple[str, str]] = lambda: TOO_FAST,
+    ) -> None:
+        """Read the file of the rig, if the options name one.
+
+        Args:
+            maker: Decodes the messages.
+            options: Topics and limits.
+            why_full: Returns the reason and the sentence for an image that does not fit into the queue.
+
+        Raises:
+            UsageError: The file of the rig cannot be used.
+        """
         self.check = InputCheck()
+        self._why_full = why_full
         self.received: Counter[str] = Counter({"colour": 0, "depth": 0, "info": 0})
         self.rig = RigTopics(options)
         self._maker, self._options = maker, options
@@ -420,4 +442,4 @@ class IncomingFrames:
         self._last_ns = stamp_ns
         if len(self._ready) > self._options.queue_frames:
             self._ready.popleft()
-            self.check.leave_out("too fast", sentence="they come faster than they are tracked")
+            self.check.leave_out(*self._why_full())

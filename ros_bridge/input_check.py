@@ -43,7 +43,7 @@ class InputCheck:
         """Count a colour image that was received."""
         self._now["received"] += 1
 
-    def leave_out(self, reason: str, *, sentence: str = "", colours: int = 1, partners: int = 0) -> None:
+    def leave_out(self, reason: str, sentence: str = "", *, colours: int = 1, partners: int = 0) -> None:
         """Count images that are not used although they are valid.
 
         Args:

@@ -30,10 +30,16 @@ HELP = {
     "depth_scale": "units of a 16-bit depth image in a metre",
     "pair_within_s": "largest difference in time of a colour image and its depth or right image, in seconds",
     "queue_frames": "largest number of frames that wait while another is tracked",
+    "odometry": "topic of the odometry of the wheels; empty: that of /tf, if there is one",
     "map_frame": "name of the frame of the map",
     "odom_frame": "name of the odometry frame",
+    "base_frame": "name of the robot's frame; empty: the camera's frame",
     "camera_frame": "name of the camera's frame (default: as in the images)",
-    "publish_odom": "whether to publish the transform from odometry frame to camera",
+    "publish_odom": "false: never publish the transform from odometry frame to robot",
+    "planar": "whether the robot stays in the plane z = 0 of the map, without roll and pitch",
+    "transform_tolerance_s": "how far in the future map to odometry frame is stamped, in seconds",
+    "max_correction_m_s": "largest speed at which map to odometry frame is corrected, in m/s; 0: at once",
+    "floor_plan_every_s": "time between two floor plans, in seconds; 0: none",
     "cloud_every_s": "time between two clouds, in seconds",
     "path_poses": "largest number of poses of a path",
     "out": "folder that the service save writes to",
@@ -51,8 +57,8 @@ class BridgeOptions:
         url: Address of the platform, ``ws://HOST:PORT/ws``.
         token_file: File that holds the robot's token; it is read again for each connection.
         enrolment: File of ``rse-pf robot enrol --out``, instead of ``url`` and ``token_file``.
-        namespace: Name of this robot, such as ``robot1``, put before the names of its topics and its odometry
-            frame.
+        namespace: Name of this robot, such as ``robot1``, put before the names of its topics and frames, but
+            not before ``map_frame``.
         map: Name of the live map that the robot shares with other robots; empty: the robot has a map of its
             own.
         colour: Topic of the colour images: ``Image``, or ``CompressedImage`` if its name ends with
@@ -71,11 +77,21 @@ class BridgeOptions:
             image.
         queue_frames: Largest number of frames that wait while another is tracked; above it, the oldest frame
             is dropped and counted.
-        map_frame: Name of the coordinate frame of the map.
-        odom_frame: Name of the odometry frame of this bridge, without the namespace.
+        odometry: Topic of the odometry of the wheels (``nav_msgs/Odometry``).  Empty: the transform from
+            odometry frame to robot on ``/tf``, if another node publishes it.
+        map_frame: Name of the coordinate frame of the map; it never gets the namespace.
+        odom_frame: Name of the odometry frame; the namespace is put before it, unless it begins with ``/``.
+        base_frame: Name of the robot's frame; the namespace is put before it, unless it begins with ``/``.
+            Empty: the camera's frame.
         camera_frame: Name of the camera's frame; empty: the name in the messages of the images.
-        publish_odom: Whether the transform from odometry frame to camera is published; set it to False if
-            another node publishes a parent of the camera's frame.
+        publish_odom: Whether the transform from odometry frame to robot may be published.  It is not if
+            another node publishes it, or if ``odometry`` is set.
+        planar: Whether the robot stays in the plane z = 0 of the map, without roll and pitch.
+        transform_tolerance_s: Time (s) by which the transform from map to odometry frame is stamped in the
+            future.
+        max_correction_m_s: Largest speed (m/s) at which a correction moves the robot in the tree of frames; a
+            rotation by 1 rad counts as 1 m.  0: corrections are applied at once.
+        floor_plan_every_s: Time between two floor plans of the robot's own map, in seconds; 0: none.
         cloud_every_s: Time between two clouds, in seconds.
         path_poses: Largest number of poses of a path; above it, every second pose is left out.
         out: Folder that the service ``save`` writes to; empty: the service fails.
@@ -103,10 +119,16 @@ class BridgeOptions:
     depth_scale: float = 1000.0
     pair_within_s: float = 0.02
     queue_frames: int = 5
+    odometry: str = ""
     map_frame: str = "map"
     odom_frame: str = "odom"
+    base_frame: str = "base_link"
     camera_frame: str = ""
     publish_odom: bool = True
+    planar: bool = False
+    transform_tolerance_s: float = 0.5
+    max_correction_m_s: float = 0.0
+    floor_plan_every_s: float = 0.0
     cloud_every_s: float = 2.0
     path_poses: int = 2000
     out: str = ""
@@ -118,6 +140,10 @@ class BridgeOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise UsageError(f"{name} = {value:g} is not above 0", hint="leave it out for the default")
+        for name in ("transform_tolerance_s", "max_correction_m_s", "floor_plan_every_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise UsageError(f"{name} = {value:g} is not 0 or above", hint="leave it out for the default")
         if not 1 <= self.queue_frames <= 100 or not 10 <= self.path_poses <= 100_000:
             raise UsageError(
                 f"queue_frames = {self.queue_frames} or path_poses = {self.path_poses} is out of range",
@@ -129,6 +155,11 @@ class BridgeOptions:
             )
         if not self.colour or not self.info:
             raise UsageError("a topic of colours and its camera_info are needed", hint="colour, info")
+        if self.map and self.floor_plan_every_s:
+            raise UsageError(
+                "a robot in a live map publishes no floor plan: the map of all robots has one",
+                hint="leave floor_plan_every_s out; rse-pf map export --format occupancy exports the plan",
+            )
         if self.map and not self.partner:
             raise UsageError(
                 "a live map needs a topic of depth, or of right images",
@@ -181,13 +212,22 @@ class BridgeOptions:
 
     @property
     def own_odom_frame(self) -> str:
-        """The name of the odometry frame with the robot's namespace before it.
+        """The name of the odometry frame with the robot's namespace before it, see `named_frame`."""
+        return self.named_frame(self.odom_frame)
+
+    @property
+    def own_base_frame(self) -> str:
+        """The name of the robot's frame with its namespace before it; empty for the camera's frame."""
+        return self.named_frame(self.base_frame) if self.base_frame else ""
+
+    def named_frame(self, frame: str) -> str:
+        """Return the name of *frame*: the namespace is put before a name without a leading slash.
 
         The namespace is part of the name because ROS adds namespaces to names of topics, but not to names of
         frames.
         """
         prefix = self.namespace.strip("/")
-        return f"{prefix}/{self.odom_frame}" if prefix else self.odom_frame
+        return frame.strip("/") if frame.startswith("/") or not prefix else f"{prefix}/{frame}"
 
 
 def _value(name: str, kind: str, value: Any) -> Any:

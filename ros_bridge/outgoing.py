@@ -1,12 +1,8 @@
-"""Turn tracked frames into ROS messages, with the time stamps of the frames.
-
-The platform states the covariance of a twist that is multiplied on the left of ``T_camera_world``.  ROS
-expects the covariance of the camera's position, and of its rotation about the fixed axes of the parent frame.
-`ros_covariance` and `with_alignment` convert them.
-"""
+"""Turn poses of the robot's base into ROS messages, with the time stamps of the images."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,22 +12,22 @@ import numpy.typing as npt
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import (
     DIAGNOSTICS,
+    OCCUPANCY_GRID,
     ODOMETRY,
     PATH,
     POINT_CLOUD,
     POSE_WITH_COVARIANCE,
+    STRING,
     TF,
 )
-from client_sdk.frontend import TrackedFrame
+from ros_bridge.base_poses import BasePose, planar_pose
+from ros_bridge.frame_tree import Transform
 from ros_bridge.options import BridgeOptions
-from rse_pf.geometry import Array
+from ros_bridge.robot_frames import RobotFrames
+from rse_pf.geometry import Array, transform
+from rse_pf.slam.occupancy import FREE, OCCUPIED, OccupancyGrid
 
-__all__ = ["Message", "OutgoingMessages", "advertised", "ros_covariance", "with_alignment"]
-
-# Covariance (6, 6) of a pose without one: so large that filters give the pose no weight.
-_UNKNOWN = np.diag(np.full(6, 1e6))
-# Levels of ``diagnostic_msgs/DiagnosticStatus``.
-_OK, _WARNING, _ERROR = 0, 1, 2
+__all__ = ["Message", "OutgoingMessages", "advertised"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,35 +37,6 @@ class Message:
     topic: str
     kind: str
     data: bytes
-
-
-def ros_covariance(covariance: Array, T_world_camera: Array) -> Array:
-    """Return the covariance ``(6, 6)`` of the camera's position and rotation in the world frame.
-
-    Args:
-        covariance: ``(6, 6)``, of the twist (metres, radians) on the left of ``T_camera_world``.
-        T_world_camera: ``(4, 4)``, the pose of the camera.
-    """
-    # exp(xi) T_camera_world has the inverse T_world_camera exp(-xi): both parts are rotated into the world.
-    rotation = np.zeros((6, 6))
-    rotation[:3, :3] = rotation[3:, 3:] = T_world_camera[:3, :3]
-    rotated: Array = rotation @ covariance @ rotation.T
-    return rotated
-
-
-def with_alignment(covariance: Array, T_map_camera: Array, alignment: Array) -> Array:
-    """Return the covariance ``(6, 6)`` of a pose in the map: that of the pose plus that of the alignment.
-
-    Args:
-        covariance: ``(6, 6)``, of position and rotation in the map if the alignment were exact.
-        T_map_camera: ``(4, 4)``, the pose of the camera in the map.
-        alignment: ``(6, 6)``, of the twist (metres, radians) on the left of ``T_map_odom``.
-    """
-    x, y, z = T_map_camera[:3, 3]
-    lever = np.eye(6)
-    lever[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    moved: Array = covariance + lever @ alignment @ lever.T
-    return moved
 
 
 def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
@@ -82,9 +49,11 @@ def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
         ("rse_pf/odometry", ODOMETRY, False),
         ("rse_pf/path", PATH, False),
         ("rse_pf/cloud", POINT_CLOUD, True),
+        ("rse_pf/status", STRING, True),
+        *((("rse_pf/floor_plan", OCCUPANCY_GRID, True),) if options.floor_plan_every_s else ()),
         ("/tf", TF, False),
         ("/diagnostics", DIAGNOSTICS, False),
-        *((("/tf_static", TF, True),) if options.imu and options.publish_odom else ()),
+        *((("/tf_static", TF, True),) if options.rig else ()),
     )
     return [(options.named(topic), kind, latched) for topic, kind, latched in topics]
 
@@ -92,103 +61,58 @@ def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
 class OutgoingMessages:
     """Makes the ROS messages of one robot, and stores the robot's path for them."""
 
-    def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
-        self._maker, self._options = maker, options
-        self._path: list[tuple[int, Array, Any]] = []
+    def __init__(self, maker: MessageMaker, options: BridgeOptions, frames: RobotFrames) -> None:
+        self._maker, self._options, self._frames = maker, options, frames
+        self._path: list[tuple[int, Array]] = []
+        self._made_path: list[Any] = []
+        self._T_map_world: Array | None = None
         self._every = 1
         self._counted = 0
 
-    def of_frame(
-        self,
-        tracked: TrackedFrame,
-        stamp_ns: int,
-        camera_frame: str,
-        *,
-        T_map_odom: Array | None,
-        alignment: Array | None = None,
-    ) -> list[Message]:
-        """Return the messages with pose, odometry and transforms of a frame; none for a lost frame.
+    def of_pose(self, pose: BasePose, stamp_ns: int) -> list[Message]:
+        """Return the messages of a pose: in the map if it is known there, and in the odometry frame.
 
-        The pose is in the map if *T_map_odom* is known, else in the odometry frame.
-
-        Args:
-            tracked: The result of the mapper.
-            stamp_ns: Time stamp of the frame's images.
-            camera_frame: Name of the camera's frame.
-            T_map_odom: ``(4, 4)``, pose of the odometry frame in the map; None if it is unknown.
-            alignment: ``(6, 6)``, covariance of *T_map_odom*; None if it is unknown or zero.
+        *stamp_ns* is the time stamp of the frame's images.
         """
-        T_odom_camera = tracked.T_world_camera
-        if T_odom_camera is None:
-            return []
-        options, odom = self._options, self._options.own_odom_frame
-        if tracked.T_new_old is not None:
-            self._move_path(tracked.T_new_old)
-        covariance, own = _UNKNOWN, _UNKNOWN
-        is_in_map = T_map_odom is not None
-        pose = T_map_odom @ T_odom_camera if T_map_odom is not None else T_odom_camera
-        if tracked.covariance is not None:
-            own = ros_covariance(tracked.covariance, T_odom_camera)
-            covariance = ros_covariance(tracked.covariance, pose)
-            if is_in_map and alignment is not None:
-                covariance = with_alignment(covariance, pose, alignment)
-        frame = options.map_frame if is_in_map else odom
-        moved = []
-        if T_map_odom is not None:
-            moved.append(self._maker.transform(stamp_ns, options.map_frame, odom, T_map_odom))
-        if options.publish_odom:
-            moved.append(self._maker.transform(stamp_ns, odom, camera_frame, T_odom_camera))
-        made = self._maker.pose_with_covariance(stamp_ns, frame, pose, covariance)
-        odometry = self._maker.odometry(stamp_ns, (odom, camera_frame), T_odom_camera, own)
-        messages = [
-            self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made),
-            self._message("rse_pf/odometry", ODOMETRY, odometry),
-        ]
-        if moved:
-            messages.append(self._message("/tf", TF, self._maker.transforms(moved)))
-        self._extend_path(stamp_ns, T_odom_camera)
+        messages = []
+        if pose.T_map_base is not None:
+            made = self._maker.pose_with_covariance(
+                stamp_ns, self._frames.map, pose.T_map_base, pose.map_covariance
+            )
+            messages.append(self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made))
+        if pose.T_odom_base is not None:
+            names = self._frames.odom, self._frames.base
+            made = self._maker.odometry(stamp_ns, names, pose.T_odom_base, pose.odom_covariance)
+            messages.append(self._message("rse_pf/odometry", ODOMETRY, made))
         return messages
 
-    def path(self) -> list[Message]:
-        """Return the message with the path in the odometry frame; none before the first pose.
+    def transforms(self, transforms: Iterable[Transform], *, is_static: bool = False) -> list[Message]:
+        """Return the message with *transforms*, of ``/tf_static`` if *is_static*; none without transforms."""
+        made = [self._maker.transform(each.stamp_ns, each.parent, each.child, each.T) for each in transforms]
+        topic = "/tf_static" if is_static else "/tf"
+        return [self._message(topic, TF, self._maker.transforms(made))] if made else []
 
-        The transform from map to odometry frame moves the whole path when the map is corrected.
+    def status(self, status: str) -> Message:
+        """Return the message with the *status* of the pose: ``visual``, ``odometry`` or ``lost``."""
+        return self._message("rse_pf/status", STRING, self._maker.make(STRING, data=status))
+
+    def path(self, T_map_world: Array) -> list[Message]:
+        """Return the message with the path in the map; none before the first pose.
+
+        *T_map_world* ``(4, 4)`` is the pose of the mapper's world in the map: a correction moves the path.
         """
         if not self._path:
             return []
-        frame = self._options.own_odom_frame
-        made = self._maker.path_of(self._path[-1][0], frame, [pose for _, _, pose in self._path])
+        if self._T_map_world is None or not np.array_equal(self._T_map_world, T_map_world):
+            self._T_map_world, self._made_path = T_map_world, []
+        for stamp_ns, T_world_base in self._path[len(self._made_path) :]:
+            pose = T_map_world @ T_world_base
+            pose = planar_pose(pose) if self._frames.is_planar else pose
+            self._made_path.append(self._maker.pose(stamp_ns, self._frames.map, pose))
+        made = self._maker.path_of(self._path[-1][0], self._frames.map, self._made_path)
         return [self._message("rse_pf/path", PATH, made)]
 
-    def imu_place(self, stamp_ns: int, camera_frame: str, imu_frame: str, T_camera_imu: Array) -> Message:
-        """Return the static transform *T_camera_imu* ``(4, 4)``, the pose of the IMU in the camera frame."""
-        moved = self._maker.transform(stamp_ns, camera_frame, imu_frame, T_camera_imu)
-        return self._message("/tf_static", TF, self._maker.transforms([moved]))
-
-    def cloud(
-        self, stamp_ns: int, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]
-    ) -> list[Message]:
-        """Return the cloud message in the odometry frame: *points* ``(n, 3)`` (m), RGB ``(n, 3)``."""
-        made = self._maker.cloud(stamp_ns, self._options.own_odom_frame, points, colours)
-        return [self._message("rse_pf/cloud", POINT_CLOUD, made)]
-
-    def diagnostics(
-        self, stamp_ns: int, *, trouble: str, is_working: bool, values: dict[str, str]
-    ) -> Message:
-        """Return the status message of the bridge.
-
-        Its level is error unless *is_working*, else warning if *trouble* is not empty, else OK; its text is
-        *trouble*, and *values* are its key-value pairs.
-        """
-        level = _ERROR if not is_working else _WARNING if trouble else _OK
-        name = f"rse_pf: {self._options.namespace.strip('/') or 'robot'}"
-        made = self._maker.diagnostics(stamp_ns, name, level, trouble or "poses are given", values)
-        return self._message("/diagnostics", DIAGNOSTICS, made)
-
-    def _message(self, topic: str, kind: str, message: Any) -> Message:
-        return Message(self._options.named(topic), kind, self._maker.encode(kind, message))
-
-    def _extend_path(self, stamp_ns: int, T_odom_camera: Array) -> None:
+    def extend_path(self, stamp_ns: int, T_world_base: Array) -> None:
         """Add a pose to the path.
 
         If the path has more than ``path_poses`` poses, drop every second one, and add later ones half as
@@ -197,14 +121,45 @@ class OutgoingMessages:
         self._counted += 1
         if self._counted % self._every:
             return
-        frame = self._options.own_odom_frame
-        self._path.append((stamp_ns, T_odom_camera, self._maker.pose(stamp_ns, frame, T_odom_camera)))
+        self._path.append((stamp_ns, T_world_base))
         if len(self._path) > self._options.path_poses:
-            self._path = self._path[::2]
+            self._path, self._made_path = self._path[::2], []
             self._every *= 2
 
-    def _move_path(self, T_new_old: Array) -> None:
-        """Transform the path into the new odometry frame by *T_new_old* ``(4, 4)``."""
-        frame = self._options.own_odom_frame
-        moved = ((stamp_ns, T_new_old @ T) for stamp_ns, T, _ in self._path)
-        self._path = [(stamp_ns, T, self._maker.pose(stamp_ns, frame, T)) for stamp_ns, T in moved]
+    def move_path(self, T_new_old: Array) -> None:
+        """Transform the path into the mapper's new world by *T_new_old* ``(4, 4)``."""
+        self._path, self._made_path = [(stamp_ns, T_new_old @ T) for stamp_ns, T in self._path], []
+
+    def cloud(
+        self,
+        stamp_ns: int,
+        T_map_world: Array,
+        points: npt.NDArray[np.float32],
+        colours: npt.NDArray[np.uint8],
+    ) -> list[Message]:
+        """Return the cloud in the map: *points* ``(n, 3)`` (m) of the mapper's world, RGB ``(n, 3)``."""
+        moved = transform(T_map_world, points.astype(np.float64)).astype(np.float32)
+        made = self._maker.cloud(stamp_ns, self._frames.map, moved, colours)
+        return [self._message("rse_pf/cloud", POINT_CLOUD, made)]
+
+    def floor_plan(self, stamp_ns: int, plan: OccupancyGrid) -> list[Message]:
+        """Return the message with the floor plan *plan*, whose grid must have the axes of the map."""
+        cells = np.full(plan.cells.shape, -1, np.int8)
+        cells[plan.cells == FREE] = 0
+        cells[plan.cells == OCCUPIED] = 100
+        T_map_corner: Array = np.eye(4)
+        T_map_corner[:3, 3] = *plan.origin_m, plan.floor_m
+        made = self._maker.occupancy_grid(stamp_ns, self._frames.map, cells, T_map_corner, plan.resolution_m)
+        return [self._message("rse_pf/floor_plan", OCCUPANCY_GRID, made)]
+
+    def diagnostics(self, stamp_ns: int, *, level: int, text: str, values: dict[str, str]) -> Message:
+        """Return the status message of the bridge; *values* are its key-value pairs.
+
+        *level* is 0 for OK, 1 for a warning, 2 for an error.
+        """
+        name = f"rse_pf: {self._options.namespace.strip('/') or 'robot'}"
+        made = self._maker.diagnostics(stamp_ns, name, level, text, values)
+        return self._message("/diagnostics", DIAGNOSTICS, made)
+
+    def _message(self, topic: str, kind: str, message: Any) -> Message:
+        return Message(self._options.named(topic), kind, self._maker.encode(kind, message))

@@ -46,6 +46,7 @@ class RigTopics:
             UsageError: The file cannot be used, or it lacks the right camera or the IMU whose topic is set.
         """
         self.rectification: Rectification | None = None
+        self._left: RigCamera | None = None
         self.imu_frame = ""
         self._options = options
         self._rig: Rig | None = None if not options.rig else read_rig(Path(options.rig))
@@ -63,6 +64,23 @@ class RigTopics:
         if self.rectification is not None:
             return self.rectification.T_body_camera
         return None if self._rig is None else self._rig.left.T_body_camera
+
+    @property
+    def T_left_rectified(self) -> Array:
+        """The pose ``(4, 4)`` of the rectified left camera in the left one; the identity without a pair."""
+        if self._left is None or self.rectification is None:
+            return np.eye(4)
+        T: Array = inverse(self._left.T_body_camera) @ self.rectification.T_body_camera
+        return T
+
+    @property
+    def T_base_left(self) -> Array | None:
+        """The pose ``(4, 4)`` of the camera of the images on the body by the file of the rig.
+
+        None without a file, and if the body of the rig is this camera.
+        """
+        T = None if self._rig is None else self._rig.left.T_body_camera
+        return None if T is None or np.allclose(T, np.eye(4)) else T
 
     @property
     def T_camera_imu(self) -> Array | None:
@@ -148,4 +166,4 @@ class RigTopics:
         return stamp_ns - (0 if self._rig is None else round(1e9 * self._rig.left.time_offset_s))
 
     def _rectify(self, left: RigCamera, right: RigCamera) -> None:
-        self.rectification = Rectification(left, right)
+        self.rectification, self._left = Rectification(left, right), left

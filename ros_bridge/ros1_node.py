@@ -85,7 +85,8 @@ class _Node:
             self._publishers[topic] = self._rospy.Publisher(
                 topic, self._raw(kind), queue_size=10, latch=latched, tcp_nodelay=True
             )
-        async with connected_bridge(self._options, self._publish, is_ros1=True) as bridge:
+        now_ns = self._now_ns
+        async with connected_bridge(self._options, self._publish, is_ros1=True, now_ns=now_ns) as bridge:
             self._subscribe(bridge)
             self._offer(bridge, loop)
             master = _Master(self._rospy)
@@ -96,6 +97,9 @@ class _Node:
             finally:
                 master.stop.set()
         return 0
+
+    def _now_ns(self) -> int:
+        return int(self._rospy.Time.now().to_nsec())
 
     def _subscribe(self, bridge: Bridge) -> None:
         for role, topic, kind in taken(self._options):

@@ -85,11 +85,18 @@ async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
         if message.topic in publishers:
             publishers[message.topic].publish(message.data)
 
-    async with connected_bridge(options, publish, is_ros1=False) as bridge:
+    def now_ns() -> int:
+        return int(node.get_clock().now().nanoseconds)
+
+    async with connected_bridge(options, publish, is_ros1=False, now_ns=now_ns) as bridge:
         for role, topic, kind in taken(options):
-            receive = functools.partial(bridge.receive, role)
-            quality = _quality(depth=queue_of(role, options), sensor=True)
-            node.create_subscription(_class_of(kind), topic, receive, quality, raw=True)
+            receive, is_kept = functools.partial(bridge.receive, role), role == "tf_static"
+            quality = _quality(depth=queue_of(role, options), sensor=not is_kept, kept=is_kept)
+            try:
+                node.create_subscription(_class_of(kind), topic, receive, quality, raw=True)
+            except UsageError:
+                if role not in ("tf", "tf_static"):  # `publishers_of` has printed what is missing
+                    raise
         _offer(node, bridge, asyncio.get_running_loop())
         executor = rclpy.executors.SingleThreadedExecutor()
         executor.add_node(node)
@@ -109,7 +116,8 @@ def publishers_of(node: Any, options: BridgeOptions) -> dict[str, Any]:
     publishers = {}
     for topic, kind, latched in advertised(options):
         try:
-            publishers[topic] = node.create_publisher(_class_of(kind), topic, _quality(kept=latched))
+            quality = _quality(depth=1 if latched else 10, kept=latched)
+            publishers[topic] = node.create_publisher(_class_of(kind), topic, quality)
         except UsageError as error:
             show(f"{topic} is not published: {error.message} ({error.hint})")
     return publishers
@@ -146,15 +154,15 @@ def _class_of(kind: str) -> Any:
         ) from error
 
 
-def _quality(*, depth: int = 10, sensor: bool = False, kept: bool = False) -> Any:
+def _quality(*, depth: int, sensor: bool = False, kept: bool = False) -> Any:
     """Return a quality of service with a queue of *depth* messages.
 
-    *sensor* makes a subscription best effort, otherwise delivery is reliable; *kept* sends the last message
-    to late subscribers, and its queue has one message.
+    *sensor* makes a subscription best effort, otherwise delivery is reliable; *kept* sends the last messages
+    to late subscribers.
     """
     qos = importlib.import_module("rclpy.qos")
     return qos.QoSProfile(
-        depth=1 if kept else depth,
+        depth=depth,
         history=qos.HistoryPolicy.KEEP_LAST,
         reliability=qos.ReliabilityPolicy.BEST_EFFORT if sensor else qos.ReliabilityPolicy.RELIABLE,
         durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if kept else qos.DurabilityPolicy.VOLATILE,

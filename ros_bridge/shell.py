@@ -13,20 +13,26 @@ from rse_pf.terminal import show
 
 __all__ = ["end_by_signal", "queue_of", "run_until", "taken"]
 
-_ROLES: tuple[Role, ...] = ("info", "right_info", "imu", "right", "depth", "colour")
+_ROLES: tuple[Role, ...] = ("info", "right_info", "imu", "odometry", "right", "depth", "colour")
+_TF_ROLES: tuple[Role, ...] = ("tf_static", "tf")
 # Length of the subscriber's queue of an IMU: half a second at 2 kHz.
 _IMU_SAMPLES = 1000
+# Length of the subscriber's queue of odometry and transforms: several nodes publish them, some at 200 Hz.
+_TRANSFORMS = 100
 
 
 def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
-    """Return role, name and type of each topic that the bridge subscribes to; camera_infos come first."""
+    """Return role, name and type of each topic to subscribe to; transforms and camera_infos come first."""
+    frames = [(role, f"/{role}", kind_of(role, "")) for role in _TF_ROLES]
     left_out = {"depth", "right"} - {options.partner}
     topics = ((role, str(getattr(options, role))) for role in _ROLES if role not in left_out)
-    return [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
+    return frames + [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
 
 
 def queue_of(role: Role, options: BridgeOptions) -> int:
     """Return the length of the subscriber's queue for the topic *role*."""
+    if role in ("odometry", *_TF_ROLES):
+        return _TRANSFORMS
     return _IMU_SAMPLES if role == "imu" else options.queue_frames
 
 

@@ -15,6 +15,7 @@ from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.message_types import (
     DIAGNOSTICS,
     IMU,
+    OCCUPANCY_GRID,
     ODOMETRY,
     PATH,
     POINT_CLOUD,
@@ -82,10 +83,7 @@ class MessageMaker:
 
     def header(self, stamp_ns: int, frame: str) -> Any:
         """Return a ``Header`` with a time stamp in nanoseconds and the name of a frame."""
-        stamp = self.make(
-            "builtin_interfaces/msg/Time", sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
-        )
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+        return self.make("std_msgs/msg/Header", stamp=self._time(stamp_ns), frame_id=frame)
 
     def pose(self, stamp_ns: int, frame: str, T: Array) -> Any:
         """Return a ``PoseStamped`` of the pose *T* ``(4, 4)``, metres, in *frame*."""
@@ -196,6 +194,24 @@ class MessageMaker:
             is_dense=True,
         )
 
+    def occupancy_grid(
+        self, stamp_ns: int, frame: str, cells: npt.NDArray[np.int8], T: Array, resolution_m: float
+    ) -> Any:
+        """Return an ``OccupancyGrid``.
+
+        Args:
+            stamp_ns: Time stamp, nanoseconds.
+            frame: Name of the frame in which the pose *T* is given.
+            cells: ``(h, w)``, percent of occupancy, -1 for unknown; row 0 has the lowest y.
+            T: ``(4, 4)``, pose of the corner of ``cells[0, 0]``, metres.
+            resolution_m: Length of a cell's edge.
+        """
+        info = self.make(
+            "nav_msgs/msg/MapMetaData", map_load_time=self._time(stamp_ns), resolution=resolution_m,
+            width=cells.shape[1], height=cells.shape[0], origin=self._pose(T),
+        )  # fmt: skip
+        return self.make(OCCUPANCY_GRID, header=self.header(stamp_ns, frame), info=info, data=cells.ravel())
+
     def diagnostics(self, stamp_ns: int, name: str, level: int, text: str, values: dict[str, str]) -> Any:
         """Return a ``DiagnosticArray`` with one status; *level* is 0 for OK, 1 for a warning, 2 for error."""
         pairs = [
@@ -206,6 +222,10 @@ class MessageMaker:
             level=level, name=name, message=text, hardware_id="", values=pairs,
         )  # fmt: skip
         return self.make(DIAGNOSTICS, header=self.header(stamp_ns, ""), status=[status])
+
+    def _time(self, stamp_ns: int) -> Any:
+        seconds, rest_ns = divmod(stamp_ns, 1_000_000_000)
+        return self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest_ns)
 
     def _with_covariance(self, kind: str, name: str, value: Any, covariance: Array) -> Any:
         numbers = np.ascontiguousarray(covariance, dtype=np.float64).ravel()

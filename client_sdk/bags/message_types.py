@@ -19,11 +19,13 @@ __all__ = [
     "FLOAT",
     "IMAGE",
     "IMU",
+    "OCCUPANCY_GRID",
     "ODOMETRY",
     "PATH",
     "POINT_CLOUD",
     "POSE",
     "POSE_WITH_COVARIANCE",
+    "STRING",
     "TF",
     "TF_OF_ROS1",
     "TRANSFORM",
@@ -38,11 +40,13 @@ TF = "tf2_msgs/msg/TFMessage"
 TF_OF_ROS1 = "tf/msg/tfMessage"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 ODOMETRY = "nav_msgs/msg/Odometry"
 PATH = "nav_msgs/msg/Path"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 FLOAT = "std_msgs/msg/Float32"
+STRING = "std_msgs/msg/String"
 TRANSFORM = "geometry_msgs/msg/Transform"
 
 _HEADER = "time stamp\nstring frame_id"
@@ -53,6 +57,7 @@ _COMMON = {
     "geometry_msgs/msg/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
     "geometry_msgs/msg/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
     FLOAT: "float32 data",
+    STRING: "string data",
     TRANSFORM: "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
     "geometry_msgs/msg/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
     "geometry_msgs/msg/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
@@ -67,6 +72,10 @@ _COMMON = {
         "geometry_msgs/TwistWithCovariance twist"
     ),
     PATH: "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses",
+    "nav_msgs/msg/MapMetaData": (
+        "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin"
+    ),
+    OCCUPANCY_GRID: "std_msgs/Header header\nnav_msgs/MapMetaData info\nint8[] data",
     TF: "geometry_msgs/TransformStamped[] transforms",
     TF_OF_ROS1: "geometry_msgs/TransformStamped[] transforms",
     IMAGE: (

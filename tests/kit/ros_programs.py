@@ -115,7 +115,7 @@ class RosPrograms:
         words = [f"--{name.replace('_', '-')}={value}" for name, value in {**self._topics, **options}.items()]
         program = self.start(
             python, "-m", "ros_bridge", shell or self.shell, "--url", url, "--token-file", str(token_file),
-            "--publish-odom=false", "--queue-frames=100", *words,
+            "--queue-frames=100", *words,
         )  # fmt: skip
         program.until(lambda lines: any(line.startswith("bridging") for line in lines))
         return program
@@ -144,9 +144,9 @@ async def own_run(
     return found
 
 
-def poses(number: int) -> Callable[[list[str]], bool]:
-    """Return whether a listener has written so many poses."""
-    return lambda lines: sum('"kind": "pose"' in line for line in lines) >= number
+def poses(number: int, kind: str = "pose") -> Callable[[list[str]], bool]:
+    """Return whether a listener has written so many poses, or lines of another *kind*."""
+    return lambda lines: sum(f'"kind": "{kind}"' in line for line in lines) >= number
 
 
 def worst_mm(heard: list[Line], expected: dict[int, np.ndarray[Any, Any]]) -> float:

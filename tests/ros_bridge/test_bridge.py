@@ -4,104 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from client_sdk.bags.message_maker import MessageMaker
-from client_sdk.bags.message_types import CAMERA_INFO, DIAGNOSTICS, IMAGE, POSE_WITH_COVARIANCE
-from client_sdk.frontend import Frame
+from client_sdk.bags.message_types import DIAGNOSTICS, POSE_WITH_COVARIANCE
+from client_sdk.commands.answer_types import PoseAnswer
+from client_sdk.frontend import PoseQuery
 from client_sdk.mapper import Mapper
-from ros_bridge import Bridge, BridgeOptions
+from ros_bridge import BridgeOptions
 from ros_bridge.bridge import connected_bridge
-from ros_bridge.outgoing import Message
 from rse_pf.errors import Unauthorized, UsageError
+from tests.kit.bridge_runs import MAKER, START_NS, Heard, count_of, drive, running, send
 from tests.kit.fake_live_map import solve
 from tests.kit.flat_world import frame_at
-from tests.kit.small_bags import raw_image
-
-START_NS = 1_700_000_000_000_000_000
-MAKER = MessageMaker(is_ros1=True)
-
-
-class Heard:
-    """What a bridge published; `until` waits for it."""
-
-    def __init__(self) -> None:
-        self.messages: list[Message] = []
-        self._changed = asyncio.Event()
-
-    def publish(self, message: Message) -> None:
-        self.messages.append(message)
-        self._changed.set()
-
-    async def until(self, enough: Callable[[list[Message]], bool]) -> None:
-        while not enough(self.messages):
-            self._changed.clear()
-            await asyncio.wait_for(self._changed.wait(), 20)
-
-    def of(self, kind: str, maker: MessageMaker) -> list[Any]:
-        return [maker.decode(kind, each.data) for each in self.messages if each.kind == kind]
-
-
-def messages_of(maker: MessageMaker, frame: Frame, row: int) -> list[tuple[str, bytes]]:
-    """Return the messages that a driver would send for a frame."""
-    stamp, camera = START_NS + row * 100_000_000, frame.camera
-    roi = maker.make(
-        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-    )
-    info = maker.make(
-        CAMERA_INFO, header=maker.header(stamp, "eye"), height=camera.height, width=camera.width,
-        distortion_model="plumb_bob", d=np.zeros(5), k=camera.matrix.ravel(), r=np.eye(3).ravel(),
-        p=np.hstack((camera.matrix, np.zeros((3, 1)))).ravel(), binning_x=0, binning_y=0, roi=roi,
-    )  # fmt: skip
-    colour = raw_image(maker, stamp, frame.rgb, "rgb8")
-    depth = raw_image(maker, stamp, np.round(1000 * frame.depth_m).astype(np.uint16), "16UC1")
-    return [
-        ("info", maker.encode(CAMERA_INFO, info)),
-        ("colour", maker.encode(IMAGE, colour)),
-        ("depth", maker.encode(IMAGE, depth)),
-    ]
-
-
-@asynccontextmanager
-async def running(heard: Heard, robot: Any = None, **options: Any) -> AsyncIterator[Bridge]:
-    """A bridge that runs, and publishes to *heard*."""
-    bridge = Bridge(
-        Mapper(ask=solve), BridgeOptions.of(options), heard.publish, is_ros1=True, robot=robot
-    )  # fmt: skip
-    task = asyncio.create_task(bridge.run())
-    try:
-        yield bridge
-        assert not task.done()
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-
-def send(bridge: Bridge, frame: Frame, row: int, *roles: str) -> None:
-    """Send the messages of a frame, or those of some roles."""
-    for role, data in messages_of(MAKER, frame, row):
-        if role in (roles or ("info", "colour", "depth")):
-            bridge.receive(role, data)  # type: ignore[arg-type]
-
-
-def count_of(kind: str, count: int) -> Callable[[list[Message]], bool]:
-    """Return whether there are so many messages of a kind."""
-    return lambda heard: sum(each.kind == kind for each in heard) >= count
-
-
-async def drive(bridge: Bridge, heard: Heard, rows: int) -> None:
-    """Send frames of the flat world, and wait for the pose of each one."""
-    for row in range(rows):
-        send(bridge, frame_at(row, depth=True), row)
-        await heard.until(count_of(POSE_WITH_COVARIANCE, row + 1))
 
 
 async def test_poses_are_those_of_the_mapper_with_the_stamps_of_the_images() -> None:
@@ -218,3 +138,53 @@ async def test_diagnostics_and_one_line_say_why_there_is_no_connection_and_the_b
     said = "no connection to the platform: the token has expired"
     assert {each.status[0].message for each in heard.of(DIAGNOSTICS, MAKER)} == {said}
     assert said in "".join(capsys.readouterr())
+
+
+async def never_answered(query: PoseQuery) -> PoseAnswer:
+    await asyncio.Event().wait()
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("connected", "reason", "text"),
+    [
+        (True, "too fast", " of 10 images were left out: they come faster"),
+        (False, "no connection", "no connection to the"),
+    ],
+    ids=["slow", "outage"],
+)
+async def test_images_that_wait_for_a_late_pose_are_left_out_with_the_cause(
+    connected: bool, reason: str, text: str
+) -> None:
+    heard = Heard()
+    robot = SimpleNamespace(connected=connected, failure=None, stats=SimpleNamespace(last_error=""))
+    async with running(
+        heard, robot, make_mapper=lambda T: Mapper(ask=never_answered), queue_frames=2
+    ) as bridge:
+        send(bridge, frame_at(0, depth=True), 0)  # the first image needs no query
+        await heard.until(count_of(POSE_WITH_COVARIANCE, 1))
+        for row in range(1, 10):
+            send(bridge, frame_at(row % 5, depth=True), row)
+            await asyncio.sleep(0)
+        heard.messages.clear()
+        await heard.until(count_of(DIAGNOSTICS, 2))
+
+    assert any(text in each.status[0].message for each in heard.of(DIAGNOSTICS))
+    for message in heard.of(DIAGNOSTICS):
+        status = message.status[0]
+        left_out = {each.key for each in status.values if "left out" in each.key and each.value != "0"}
+        assert left_out == {f"left out: {reason}"}
+        assert status.level == (1 if connected else 2)
+
+
+async def test_a_robot_that_is_lost_for_long_is_an_error() -> None:
+    heard = Heard()
+    async with running(heard, clock=lambda: 10 * time.monotonic()) as bridge:
+        await drive(bridge, heard, 2)
+        heard.messages.clear()
+        await heard.until(
+            lambda _: any(each.status[0].message.startswith("lost for ") for each in heard.of(DIAGNOSTICS))
+        )
+
+    status = heard.of(DIAGNOSTICS)[-1].status[0]
+    assert (status.level, {each.key: each.value for each in status.values}["status"]) == (2, "lost")

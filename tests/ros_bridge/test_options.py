@@ -13,6 +13,9 @@ def test_topics_and_frames_of_a_robot_have_its_namespace() -> None:
     assert options.named("rse_pf/pose") == "/fleet/robot1/rse_pf/pose"
     assert options.named("/tf") == "/tf"
     assert options.own_odom_frame == "fleet/robot1/odom"
+    assert options.own_base_frame == "fleet/robot1/base_link"
+    assert BridgeOptions(namespace="robot1", base_frame="/base_link").own_base_frame == "base_link"
+    assert BridgeOptions(namespace="robot1", base_frame="").own_base_frame == ""
     assert BridgeOptions().named("rse_pf/pose") == "/rse_pf/pose"
 
 

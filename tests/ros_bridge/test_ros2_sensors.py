@@ -59,7 +59,7 @@ async def test_a_stereo_pair_gives_the_poses_of_the_sdk(
 ) -> None:
     """By the ``CameraInfo`` of both cameras; or by a rig, with ``sensor_msgs/Imu`` of 200 Hz."""
     token_file, rig_file = tmp_path / "token", stereo.with_name("rig.json")
-    extra = {"imu": "/imu", "rig": str(rig_file), "publish_odom": "true"} if has_imu else {}
+    extra = {"imu": "/imu", "rig": str(rig_file), "base_frame": ""} if has_imu else {}
     options = BagOptions(
         colour=STEREO["colour"], right=STEREO["right"], use_stereo=True, use_imu=has_imu,
         rig=read_rig(rig_file) if has_imu else None,

@@ -24,7 +24,15 @@ ARGUMENTS = {
     "rig": "",
     "queue_frames": "5",
     "pair_within_s": "0.02",
+    "odometry": "",
+    "map_frame": "map",
+    "odom_frame": "odom",
+    "base_frame": "base_link",
     "publish_odom": "true",
+    "planar": "false",
+    "transform_tolerance_s": "0.5",
+    "max_correction_m_s": "0.0",
+    "floor_plan_every_s": "0.0",
     "out": "",
 }
 
@@ -38,8 +46,21 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("python", default_value=sys.executable),
             *(DeclareLaunchArgument(name, default_value=value) for name, value in ARGUMENTS.items()),
+            DeclareLaunchArgument("use_sim_time", default_value="false"),
             ExecuteProcess(
-                cmd=[LaunchConfiguration("python"), "-m", "ros_bridge", "ros2", *options], output="screen"
+                cmd=[
+                    LaunchConfiguration("python"),
+                    "-m",
+                    "ros_bridge",
+                    "ros2",
+                    *options,
+                    "--ros-args",
+                    "-p",
+                    ["use_sim_time:=", LaunchConfiguration("use_sim_time")],
+                ],
+                output="screen",
+                respawn=True,
+                respawn_delay=2.0,
             ),
         ]
     )
