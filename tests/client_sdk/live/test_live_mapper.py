@@ -23,6 +23,7 @@ from client_sdk.live.keyframe_queue import (
     choose_number_offset,
 )
 from client_sdk.live.keyframe_sender import make_request
+from client_sdk.wheel_odometry import OdometryReading
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, MissingExtra, UsageError
 from rse_pf.geometry import exp_se3
@@ -319,6 +320,43 @@ async def test_a_lost_robot_begins_a_segment_and_is_relocalised(robot: FakeLiveR
         robot.publish("alignment/me", alignment("me", None, segment=1, reason="too few closures"))
         robot.publish("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
         await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
+
+
+async def test_wheels_carry_the_pose_in_the_map_until_the_next_segment_is_aligned(
+    robot: FakeLiveRobot,
+) -> None:
+    T_base_camera = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+
+    def wheels(row: int) -> list[OdometryReading]:
+        T_odom_base = exp_se3([0.0, -STEP_M * row, 0, 0, 0, 0])
+        return [OdometryReading(timestamp_s=row / 10, T_odom_base=T_odom_base)]
+
+    async with live_map(robot, T_base_camera=T_base_camera) as mapper:
+        for row in range(3):
+            await mapper.track(frame_at(row, depth=True), odometry=wheels(row))
+        await robot.until(lambda: len(robot.kept) == 1 and robot.asked[-1] == "live-show")
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
+        await robot.until(lambda: mapper.aligned)
+
+        lost = await mapper.track(covered(frame_at(3, depth=True)), odometry=wheels(3))
+        rows = range(4, 12)
+        later = [await mapper.track(foreign(frame_at(row, depth=True)), odometry=wheels(row)) for row in rows]
+
+        assert (lost.status, lost.pose_source) == ("odometry", "odometry")
+        assert (later[-1].segment, later[-1].pose_source, mapper.aligned) == (1, "visual", False)
+        begun = next(each for each in later if each.segment == 1)
+        for each in (lost, begun):
+            assert each.T_map_camera is not None
+            row = 10 * each.frame.timestamp_s
+            expected = T_MAP_ODOM @ exp_se3([0.0, -STEP_M * row, 0, 0, 0, 0]) @ T_base_camera
+            np.testing.assert_allclose(each.T_map_camera, expected, atol=0.01)
+        assert lost.frame.timestamp_s not in mapper.map_trajectory.timestamps_s
+
+        robot.publish("alignment/me", alignment("me", np.eye(4), segment=1))
+        await robot.until(lambda: mapper.aligned)
+        aligned = await mapper.track(foreign(frame_at(12, depth=True)), odometry=wheels(12))
+        assert aligned.corrected
+        np.testing.assert_allclose(aligned.T_map_camera, aligned.T_world_camera)
 
 
 async def test_relocalise_sends_the_next_keyframe_without_a_pause(robot: FakeLiveRobot) -> None:
