@@ -35,7 +35,7 @@ from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
 from ros_bridge.robot_frames import RobotFrames
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.slam.occupancy import GridOptions
 from rse_pf.terminal import show
 
@@ -133,6 +133,7 @@ class Bridge:
             "floor plan": clock() + options.floor_plan_every_s,
         }
         self._stamp_ns = 0
+        self._T_map_world: Array | None = None
         self._last_s = float("-inf")
         self._reason = ""
         self._cloud: asyncio.Task[None] | None = None
@@ -258,7 +259,9 @@ class Bridge:
                 await self._bridge(images)
 
     async def _bridge(self, images: PairedImages) -> None:
-        frame = await asyncio.to_thread(self._incoming.decode, images)
+        frames = self._frames
+        has_wheels = frames.T_base_camera is not None and frames.newest_odometry_ns is not None
+        frame = await asyncio.to_thread(self._incoming.decode, images, keeps_repeated=has_wheels)
         if frame is None:
             return
         mapper = self._mapper or await self._begin(images)
@@ -328,12 +331,15 @@ class Bridge:
         return tracked
 
     def _publish_poses(self, mapper: Mapper | LiveMapper, tracked: TrackedFrame, stamp_ns: int) -> None:
-        T_map_world, alignment = self._alignment(mapper)
+        T_map_world, alignment = self._alignment(mapper, tracked)
+        self._T_map_world = T_map_world
         if tracked.T_new_old is not None:
             self._outgoing.move_path(tracked.T_new_old)
         pose = self._poses.add(tracked, stamp_ns, T_map_world, alignment)
         is_in_map = pose is not None and pose.T_map_base is not None
         self._frame_status = tracked.pose_source if is_in_map else "lost"
+        if pose is None and tracked.T_world_camera is not None:
+            self._reason = "no pose of the base before the scale of the map is known"
         self._update_status()
         if pose is None:
             return
@@ -345,7 +351,7 @@ class Bridge:
 
     def _publish_map(self, mapper: Mapper | LiveMapper, stamp_ns: int) -> None:
         """Publish path and cloud if they are due, and the pose of the mapper's world in the map is known."""
-        now, (T_map_world, _) = self._clock(), self._alignment(mapper)
+        now, T_map_world = self._clock(), self._T_map_world
         if T_map_world is None:
             return
         if now >= self._due["path"]:
@@ -421,14 +427,20 @@ class Bridge:
             self._status = status
             self._publish(self._outgoing.status(status))
 
-    def _alignment(self, mapper: Mapper | LiveMapper) -> tuple[Array | None, Array | None]:
+    def _alignment(
+        self, mapper: Mapper | LiveMapper, tracked: TrackedFrame
+    ) -> tuple[Array | None, Array | None]:
         """Return the pose ``(4, 4)`` of the mapper's world in the map and its covariance ``(6, 6)``.
 
         Both may be None with a live map.  A robot with a map of its own has the identity and None.
         """
-        if isinstance(mapper, LiveMapper):
-            return mapper.T_map_odom, mapper.covariance
-        return _IDENTITY, None
+        if not isinstance(mapper, LiveMapper):
+            return _IDENTITY, None
+        T_map_world, pose = mapper.T_map_odom, tracked.T_world_camera
+        if T_map_world is None and pose is not None and tracked.T_map_camera is not None:
+            # The segment is not aligned yet, and continues one that is: the wheels have carried the pose.
+            T_map_world = tracked.T_map_camera @ inverse(pose)
+        return T_map_world, mapper.covariance
 
     async def _publish_cloud(self, mapper: Mapper | LiveMapper, stamp_ns: int, T_map_world: Array) -> None:
         def made() -> list[Message]:

@@ -222,15 +222,21 @@ class IncomingFrames:
         with self._lock:
             return self._ready.popleft() if self._ready and not self._waits_for_imu() else None
 
-    def decode(self, images: PairedImages) -> Frame | None:
+    def decode(self, images: PairedImages, *, keeps_repeated: bool = False) -> Frame | None:
         """Decode *images* and return the undistorted frame; None if they cannot be used, which is counted.
 
+        With *keeps_repeated*, an image that repeats the one before is reported but used: the mapper of a
+        robot with wheels knows what to do with it.
         An image of a camera_info other than the first one is mapped to the camera of the first one.
         """
         try:
             stated = self._camera_at(images.stamp_ns)
             wanted, rectifier = stated.rectified, stated.rectifier
-            self._refuse_repeated(images)
+            if repeated := self._find_repeated(images):
+                if not keeps_repeated:
+                    raise _RepeatedImage(repeated)
+                with self._lock:
+                    self.check.note(repeated)
             rgb = decode_colour(images.colour)
             if rgb.shape[:2] != (wanted.height, wanted.width):
                 raise BrokenMessage(
@@ -301,8 +307,8 @@ class IncomingFrames:
         self.check.refuse("stamp", f"images of {self._topic(role)} cannot be put in order: {fault}")
         return True
 
-    def _refuse_repeated(self, images: PairedImages) -> None:
-        """Raise _RepeatedImage for an image with the bytes of the previous one: its camera is frozen.
+    def _find_repeated(self, images: PairedImages) -> str:
+        """Return a sentence if an image has the bytes of the previous one: its camera is frozen.
 
         The noise of a working camera changes the bytes even if the camera is stationary.  Depth images, and
         images with a single brightness, are not checked, since they may be the same for a moving camera.
@@ -313,9 +319,8 @@ class IncomingFrames:
             pixels = np.asarray(message.data)
             before, self._last_pixels[role] = self._last_pixels.get(role), pixels
             if before is not None and np.array_equal(before, pixels) and np.ptp(pixels):
-                raise _RepeatedImage(
-                    f"{self._topic(role)} repeats an image with a new stamp: its camera is frozen"
-                )
+                return f"{self._topic(role)} repeats an image with a new stamp: its camera is frozen"
+        return ""
 
     def _refuse_other_unit(self, depth_m: Any) -> None:
         median_m = median_depth_m([depth_m])

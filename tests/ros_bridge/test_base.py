@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -307,7 +306,8 @@ async def test_map_to_odom_is_stamped_ahead_of_now_or_of_the_image(has_clock: bo
     assert [stamp for stamp, _ in heard.transforms("map", "odom")] == [expected]
 
 
-async def test_while_the_camera_is_covered_the_wheels_carry_the_pose_and_the_status_says_so() -> None:
+@pytest.mark.parametrize("fault", ["covered", "frozen"])
+async def test_while_the_camera_fails_the_wheels_carry_the_pose_and_the_status_says_so(fault: str) -> None:
     """The camera of the flat world looks ahead, and moves to the right by one step in each frame."""
     heard, right = Heard(), np.array([0.0, -STEP_M, 0.0, 0.0, 0.0, 0.0])
 
@@ -324,12 +324,9 @@ async def test_while_the_camera_is_covered_the_wheels_carry_the_pose_and_the_sta
             for part in range(-4, 2):
                 stamp_ns = START_NS + row * STEP_NS + part * STEP_NS // 5
                 send_odometry(bridge, stamp_ns, wheels_at(stamp_ns), ("odom", "base_link"))
-            frame = frame_at(row, depth=True)
-            send(
-                bridge,
-                replace(covered(frame), timestamp_s=frame.timestamp_s) if row in (4, 5) else frame,
-                row,
-            )
+            is_faulty = row in (4, 5)
+            frame = frame_at(3 if is_faulty and fault == "frozen" else row, depth=True)
+            send(bridge, covered(frame) if is_faulty and fault == "covered" else frame, row)
             await heard.until(count_of(POSE_WITH_COVARIANCE, row + 1))
 
     poses = heard.of(POSE_WITH_COVARIANCE)
