@@ -339,7 +339,7 @@ def figures_after(drive: Drive, run: Run, last: int) -> dict[str, Any]:
     end = drive.true_motion(0, len(drive.frames) - 1)
     pose = run.tracked[-1].T_world_base
     return {
-        "visual_after_s": None if back is None else float(stamps_s[back] - stamps_s[last]),
+        "visual_after_s": None if back is None else round(float(stamps_s[back] - stamps_s[last]), 3),
         "segment_at_end": run.tracked[-1].segment,
         "error_at_end_cm": None if pose is None else 100.0 * float(np.linalg.norm((pose - end)[:3, 3])),
     }
@@ -357,7 +357,7 @@ def row_of_repeat(seed: int) -> dict[str, Any]:
     return {
         "drive": drive.name,
         "first_repeated": first,
-        "named_s": None if named is None else float(stamps_s[named] - stamps_s[first]),
+        "named_s": None if named is None else round(float(stamps_s[named] - stamps_s[first]), 3),
         "reason": "" if named is None else both.tracked[named].reason,
         "visual_poses": len(visual),
         "visual_frames": visual,
