@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +35,8 @@ class BasePose:
         T_world_base: In the world of the mapper.
         T_map_base: In the map; None while the pose of the world in the map is not known.
         map_covariance: Of position and rotation about the axes of the map.
-        T_odom_base: By visual odometry in the odometry frame; None before the robot's own odometry is known.
+        T_odom_base: By visual odometry in the odometry frame; None before the robot's own odometry is known,
+            and while that odometry carries the pose.
         odom_covariance: Of position and rotation about the axes of the odometry frame.
     """
 
@@ -103,7 +104,9 @@ class BasePoses:
             if tracked.T_new_old is not None and self._T_odom_world is not None:
                 self._T_odom_world = self._T_odom_world @ inverse(tracked.T_new_old)
             pose = self._pose(T_world_base, covariance, T_map_world, alignment)
-            if tracked.pose_source == "visual" or not is_foreign:
+            if tracked.pose_source == "odometry":
+                pose = replace(pose, T_odom_base=None)
+            else:
                 self._waiting.append((stamp_ns, pose))
             self._correct()
             return pose

@@ -333,6 +333,8 @@ async def test_while_the_camera_fails_the_wheels_carry_the_pose_and_the_status_s
     steps = [each.pose.pose.position.y / -STEP_M for each in poses]
     assert steps == pytest.approx(range(8), abs=0.2)
     assert poses[5].pose.covariance[0] > poses[3].pose.covariance[0]
+    stamps = [stamp_of(each) for each in heard.of(ODOMETRY)]
+    assert [(each - START_NS) // STEP_NS for each in stamps] == [1, 2, 3, 6, 7]
     assert [each.data for each in heard.of(STRING)] == ["lost", "visual", "odometry", "visual"]
     distance_m, angle_deg = pose_difference(heard.transforms("map", "odom")[-1][1], inverse(ODOM_START))
     assert distance_m < 0.01
@@ -411,3 +413,20 @@ async def test_a_floor_plan_is_in_the_map_with_percents_of_occupancy() -> None:
     assert plan.data.tolist() == [100, -1, 0, 0, 0, 0]
     corner = plan.info.origin.position
     assert (corner.x, corner.y, plan.info.resolution) == (-1.0, 2.0, 0.25)
+
+
+async def test_wheels_that_start_late_replace_the_odometry_by_the_camera() -> None:
+    heard = Heard()
+    async with running(heard, make_mapper=ExactMapper, before=send_urdf, base_frame="base_link") as bridge:
+        await drive_exactly(bridge, heard, "own")
+        send_transforms(bridge, "tf", [(START_NS, "odom", "base_link", wheels(START_NS))])
+        heard.messages.clear()
+        for row in (ROWS, ROWS + 1):
+            send(bridge, frame_at(row, depth=True), row)
+            send_wheels(bridge, "tf", row)
+            await heard.until(count_of(POSE_WITH_COVARIANCE, row - ROWS + 1))
+        last_ns = START_NS + (ROWS + 1) * STEP_NS
+        expected = true_pose(last_ns) @ inverse(wheels(last_ns))
+        await heard.until(has_transform(heard, "map", "odom", expected))
+
+    assert heard.parents() == {"odom": {"map"}}
