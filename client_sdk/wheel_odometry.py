@@ -14,7 +14,7 @@ import numpy as np
 
 from client_sdk.wheel_check import WheelCheck
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, exp_se3, inverse, log_se3, rigid, rotation_angle_deg, skew
+from rse_pf.geometry import Array, inverse, orthonormalise, rigid, rotation_angle_deg, skew
 
 __all__ = ["BaseCovariance", "OdometryReading", "WheelMotion", "WheelOdometry"]
 
@@ -139,7 +139,7 @@ class WheelOdometry:
         self._count = 0
         self._stamps_s: Array = np.empty(2 * _MAX_READINGS)
         self._poses: Array = np.empty((2 * _MAX_READINGS, 4, 4))
-        self._paths: Array = np.zeros((2 * _MAX_READINGS, 3))
+        self._paths: Array = np.zeros((3, 2 * _MAX_READINGS))
         """Length in metres, sum of rotations in rad, and heading in rad without wrap, up to each reading."""
 
     @property
@@ -170,15 +170,16 @@ class WheelOdometry:
             if n and reading.timestamp_s == self._stamps_s[n - 1]:
                 continue
             if n == 2 * _MAX_READINGS:
-                for table in (self._stamps_s, self._poses, self._paths):
+                for table in (self._stamps_s, self._poses, *self._paths):
                     table[:_MAX_READINGS] = table[_MAX_READINGS:]
                 n = _MAX_READINGS
             if n:
-                step = inverse(self._poses[n - 1]) @ reading.T_odom_base
-                length_m = float(np.linalg.norm(step[:3, 3]))
-                self._paths[n] = self._paths[n - 1]
-                angle_rad = math.radians(rotation_angle_deg(step[:3, :3]))
-                self._paths[n] += length_m, angle_rad, math.atan2(step[1, 0], step[0, 0])
+                last, new = self._poses[n - 1], reading.T_odom_base
+                way_m, R_last_new = new[:3, 3] - last[:3, 3], last[:3, :3].T @ new[:3, :3]
+                angle_rad = math.radians(rotation_angle_deg(R_last_new))
+                yaw_rad = math.atan2(R_last_new[1, 0], R_last_new[0, 0])
+                self._paths[:, n] = self._paths[:, n - 1]
+                self._paths[:, n] += math.sqrt(way_m @ way_m), angle_rad, yaw_rad
             self._stamps_s[n], self._poses[n] = reading.timestamp_s, reading.T_odom_base
             self._count = n + 1
 
@@ -200,10 +201,9 @@ class WheelOdometry:
         is_outside = not begin_s - _MAX_EXTRAPOLATION_S <= timestamp_s <= end_s + _MAX_EXTRAPOLATION_S
         if is_outside or (end_s - begin_s > _MAX_GAP_S and timestamp_s not in (begin_s, end_s)):
             return None
-        start, end = self._poses[after - 1], self._poses[after]
+        # Between two readings the robot turns little: a matrix in between is nearly a rotation.
         share = (timestamp_s - begin_s) / (end_s - begin_s)
-        pose: Array = start @ exp_se3(share * log_se3((inverse(start) @ end)[None])[0])
-        return pose
+        return orthonormalise((1.0 - share) * self._poses[after - 1] + share * self._poses[after])
 
     def motion(self, begin_s: float, end_s: float) -> WheelMotion | None:
         """Return the motion of the base between two times; None if the readings do not tell it.
@@ -218,15 +218,15 @@ class WheelOdometry:
         if begin is None or end is None:
             return None
         T_begin_end = inverse(begin) @ end
-        stamps_s, paths = self._stamps_s[: self._count], self._paths[: self._count]
-        length_m, angle_rad = (
-            float(np.diff(np.interp((begin_s, end_s), stamps_s, path))[0]) for path in paths.T[:2]
+        stamps_s, paths = self._stamps_s[: self._count], self._paths[:2, : self._count]
+        (begin_m, end_m), (begin_rad, end_rad) = (
+            np.interp((begin_s, end_s), stamps_s, path).tolist() for path in paths
         )
         return WheelMotion(
             T_begin_end=T_begin_end,
             T_camera_begin_end=self._T_camera_base @ T_begin_end @ self.T_base_camera,
-            length_m=max(length_m, float(np.linalg.norm(T_begin_end[:3, 3]))),
-            angle_rad=max(angle_rad, math.radians(rotation_angle_deg(T_begin_end[:3, :3]))),
+            length_m=max(end_m - begin_m, float(np.linalg.norm(T_begin_end[:3, 3]))),
+            angle_rad=max(end_rad - begin_rad, math.radians(rotation_angle_deg(T_begin_end[:3, :3]))),
         )
 
     def compare(self, timestamp_s: float, T_world_base: Array, world: object) -> None:
@@ -238,7 +238,7 @@ class WheelOdometry:
         if not check.add(timestamp_s, T_world_base, world):
             return
         motion = self._measure(*check.window_s)
-        headings = self._stamps_s[: self._count], self._paths[: self._count, 2]
+        headings = self._stamps_s[: self._count], self._paths[2, : self._count]
         check.close(None if motion is None else motion.T_begin_end, *headings)
 
     def camera_position(self, timestamp_s: float) -> Array | None:
