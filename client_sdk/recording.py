@@ -134,6 +134,12 @@ def make_robot_recorder(
             )
         return _GuardedRecorder(record, callbacks)
     # The only import of an extension in the SDK, so that `record=` needs nothing but a folder from its user.
-    from rse_pf.extensions.recording.robot_recorder import RobotRecorder as FileRecorder
+    try:
+        from rse_pf.extensions.recording.robot_recorder import RobotRecorder as FileRecorder
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"recordings were removed from this installation: {error}",
+            hint="leave out record=, or give a recorder of your own",
+        ) from error
 
     return FileRecorder(record, thumbnails=thumbnails, session=session, version=version)

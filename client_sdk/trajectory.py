@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.source_facts import stamps_in_seconds
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, body_poses, exp_se3, from_quaternion, inverse, log_se3, to_quaternion
 from rse_pf.storage.files import read_regular_file
 
-__all__ = ["Trajectory", "read_trajectory", "write_trajectory"]
+__all__ = ["Trajectory", "read_odometry", "read_trajectory", "write_trajectory"]
 
 _BODY_SUFFIX = "-body"
 """Suffix of the file name of a body's trajectory: ``trajectory-body.txt``, written next to the camera's
@@ -144,3 +145,15 @@ def read_trajectory(path: Path) -> Trajectory:
         timestamps_s.append(float(values[0]))
         poses.append(pose)
     return Trajectory(np.array(timestamps_s), np.array(poses).reshape(-1, 4, 4))
+
+
+def read_odometry(file: Path) -> Trajectory:
+    """Read a path in TUM format, and convert its time stamps to seconds if they have another unit.
+
+    Raises:
+        UsageError: The file is broken, or holds fewer than two poses.
+    """
+    path = read_trajectory(file)
+    if len(path) < 2:
+        raise UsageError(f"{file} holds {len(path)} poses", hint="give a path of 2 poses or more")
+    return Trajectory(stamps_in_seconds(path.timestamps_s, str(file))[0], path.T_world_camera)

@@ -26,8 +26,8 @@ from benchmarks.recorded_drives import Run, drive, red_kitchen, truth_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import ate_m
 from rse_pf.extensions.experiments.results.map_error import move_frames
-from rse_pf.extensions.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured, MapStarted
 from rse_pf.live_map.live_map import LiveMap

@@ -37,8 +37,8 @@ from client_sdk.simulator import make_world, true_trajectory
 from client_sdk.simulator.renderer import Renderer, add_image_noise
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import accuracy
 from rse_pf.errors import CommandFailed
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Camera
 from rse_pf.images import load_opencv
 

@@ -49,7 +49,7 @@ from client_sdk.simulator import World, make_world, render_along
 from client_sdk.simulator.world import DEPTH_M, HEIGHT_M, ROOM_M, Face
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
+from client_sdk.trajectory_error import accuracy
 from rse_pf.geometry import inverse, rotation_angle_deg
 
 PARTS = ("drives", "rest", "rotation", "planes")

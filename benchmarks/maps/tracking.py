@@ -35,7 +35,7 @@ from client_sdk.simulator.world import make_world
 from client_sdk.tracking.segment_join import Join
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
+from client_sdk.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse
 
 _TURNING = "tum_fr1_rpy_start"

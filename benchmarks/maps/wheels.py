@@ -35,8 +35,8 @@ from client_sdk.mapper import Mapper
 from client_sdk.simulator.base import STEP_S, T_BASE_CAMERA, BaseDrive, Lie, drive_route, render_base
 from client_sdk.simulator.building import BUILDINGS, Building, make_building
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import accuracy
 from client_sdk.wheel_odometry import OdometryReading
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse
 
 PARTS = ("drives", "lies", "covers", "repeats", "cpu")

@@ -36,6 +36,7 @@ from client_sdk.rigs.benchmark_files import read_euroc_camera
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig_file import read_intrinsics
 from client_sdk.trajectory import Trajectory, read_trajectory
+from client_sdk.trajectory_error import accuracy
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.compare.configurations import Configuration, configurations_of
@@ -44,7 +45,6 @@ from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 from rse_pf.extensions.experiments.compare.tracking_run import longest_gap_s, track
 from rse_pf.extensions.experiments.results.markdown import page, table
 from rse_pf.extensions.experiments.results.result_folder import environment, load_average, write_json
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse
 
 __all__ = []

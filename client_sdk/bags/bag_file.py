@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from client_sdk.auto_close import AutoClose
+from client_sdk.bag_paths import is_bag, only_bag_of
 from client_sdk.bags.decompression import Allowance, bound_reader, charge
 from client_sdk.bags.message_types import load_types
 from rse_pf.errors import MissingExtra, UsageError
 
-__all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "is_bag", "open_bag_file"]
+__all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "open_bag_file"]
 
-_ENDINGS = (".bag", ".db3", ".mcap")  # endings of bag files
 _FAULTS = (
     ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError,
     RuntimeError, TypeError, ValueError, struct.error,
@@ -52,13 +52,6 @@ class RawMessage:
     data: bytes
 
 
-def is_bag(path: Path) -> bool:
-    """Return whether a path is a ROS bag: a bag file, or a folder of one or with ``metadata.yaml``."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file() or _only_bag_of(path) is not None
-    return path.suffix in _ENDINGS
-
-
 def open_bag_file(path: Path) -> BagFile:
     """Open a ``.bag``, ``.db3`` or ``.mcap`` file, or the folder of a ROS 2 bag.
 
@@ -73,7 +66,7 @@ def open_bag_file(path: Path) -> BagFile:
             f"{path} is not a ROS bag", hint="name a .bag, .db3 or .mcap file, or a bag's folder"
         )
     if path.is_dir() and not (path / "metadata.yaml").is_file():
-        path = _only_bag_of(path) or path
+        path = only_bag_of(path) or path
     is_ros1 = path.suffix == ".bag" and path.is_file()
     store = load_types(is_ros1=is_ros1)
     reader = _reader(path, is_ros1)
@@ -164,12 +157,6 @@ class BagFile(AutoClose):
     def close(self) -> None:
         """Release the file; no message can be read any more."""
         self._release()
-
-
-def _only_bag_of(folder: Path) -> Path | None:
-    """Return the only file in a folder with the ending of a bag; None for no such file, or several."""
-    bag_paths = [path for path in folder.iterdir() if path.suffix in _ENDINGS and path.is_file()]
-    return bag_paths[0] if len(bag_paths) == 1 else None
 
 
 def _reader(path: Path, is_ros1: bool) -> Any:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from client_sdk.bag_paths import BAG_ENDINGS
 from client_sdk.cameras.folder import list_folder, list_pairs, pair_folders
 from client_sdk.cameras.opencv_video import open_video
 from client_sdk.cameras.pairs import open_pair_videos, split_pairs
@@ -37,7 +38,6 @@ from rse_pf.storage.files import check_exists
 
 __all__ = ["is_device", "is_recording", "open_camera", "source_of_frames"]
 
-_BAG_ENDINGS = {".bag", ".mcap", ".db3"}  # files that `client_sdk.bags` reads, and `open_camera` refuses
 _REALSENSE = "realsense"  # name of a source that is a device, and not a file
 _SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
 
@@ -131,7 +131,7 @@ def open_camera(
         frames = raw if depth else ((stamp_s, rgb, None) for stamp_s, rgb, _ in raw)
         return _open_single(facts, lambda log: frames, lens, rate_hz, depth, close)
     # 3. Open a recording of a benchmark; refuse a bag, which another command reads.
-    if path.suffix in _BAG_ENDINGS or (path / "metadata.yaml").is_file():
+    if path.suffix in BAG_ENDINGS or (path / "metadata.yaml").is_file():
         raise UsageError(
             f"{word} is a bag",
             hint="read it with rse-pf map from-bag (extra bags)",

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from client_sdk.check.observer import DriveObserver
 from client_sdk.source_facts import doubt_line
 
 if TYPE_CHECKING:
     from client_sdk.check.motion import MotionReference
-    from client_sdk.check.observer import DriveObserver
     from client_sdk.frontend import Frame, TrackedFrame
+    from client_sdk.mapper import Mapper
     from client_sdk.source_facts import Doubt
-    from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 
 __all__ = ["DriveCheck", "check_lines"]
 
@@ -65,16 +65,9 @@ class DriveCheck:
     The first exception of the observer stops the check, and is reported in its result instead of raised.
     """
 
-    def __init__(self, *, is_wanted: bool, is_thinned: bool = False) -> None:
-        self._observer: DriveObserver | None = None
+    def __init__(self, *, is_thinned: bool = False) -> None:
         self._failed = ""
-        if is_wanted:
-            self._observer = self._tried(lambda: _observer(is_thinned=is_thinned))
-
-    @property
-    def is_wanted(self) -> bool:
-        """Whether the check still runs: the user wants the check, and no error has stopped it."""
-        return self._observer is not None
+        self._observer = self._tried(lambda: DriveObserver(is_thinned=is_thinned))
 
     def add(self, frame: Frame, tracked: TrackedFrame) -> None:
         """Pass the next frame and the result of tracking it to the observer, if the check still runs."""
@@ -92,38 +85,37 @@ class DriveCheck:
 
     def finish(
         self,
+        mapper: Mapper | None = None,
         reference: MotionReference | None = None,
-        offsets: Mapping[int, StereoAdjustment] | None = None,
         doubts: Sequence[Doubt] = (),
         accepted: Iterable[str] = (),
-    ) -> dict[str, Any] | None:
+    ) -> dict[str, Any]:
         """Check the whole drive, and return the result as ``report.json`` stores it.
 
-        A check that an error stopped returns ``{"failed": message}``, and one that was not wanted None.
+        A check that an error stopped returns ``{"failed": message}``.
 
         Args:
+            mapper: Tracked the drive; its stereo pairs are adjusted, which may change its keyframes.  None
+                without such pairs.
             reference: The path that the motion of the camera is compared with.
-            offsets: The results of `Mapper.adjust_pairs` by number of the segment, for a stereo drive.
             doubts: Doubts about the source that the user has not accepted.
             accepted: Names of doubts that the user has accepted.
         """
         observer = self._observer
         if observer is not None:
             observer.reference = reference
-            observer.add_offsets(offsets or {})
+            observer.add_offsets({} if mapper is None else mapper.adjust_pairs())
             report = self._tried(lambda: observer.finish(doubts, accepted))
             if report is not None:
                 return report.to_dict()
-        return {"failed": self._failed} if self._failed else None
+        return {"failed": self._failed}
 
     @staticmethod
-    def lines(report: Mapping[str, Any] | None, shown: Collection[str] = ()) -> list[str]:
-        """Return short lines of text for *report*, the result of `finish`; no line if it is None.
+    def lines(report: Mapping[str, Any], shown: Collection[str] = ()) -> list[str]:
+        """Return short lines of text for *report*, the result of `finish`.
 
         Doubts whose lines were *shown* before are left out.
         """
-        if report is None:
-            return []
         failed = report.get("failed")
         return (
             [f"check: it failed ({failed}); --no-check leaves it out"]
@@ -138,10 +130,3 @@ class DriveCheck:
             self._failed = f"{type(error).__name__}: {error}".splitlines()[0][:200]
             self._observer = None
             return None
-
-
-def _observer(*, is_thinned: bool) -> DriveObserver:
-    # The observer imports much, so it is imported only if a check is wanted.
-    from client_sdk.check.observer import DriveObserver
-
-    return DriveObserver(is_thinned=is_thinned)

@@ -22,9 +22,7 @@ import numpy.typing as npt
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.imu.checks import RateCheck, check_rates, find_sample_trouble
 from client_sdk.imu.history import ImuHistory
-from client_sdk.source_facts import stamps_in_seconds
-from client_sdk.trajectory import Trajectory, read_trajectory
-from rse_pf.errors import UsageError
+from client_sdk.trajectory import Trajectory, read_odometry
 from rse_pf.geometry import Array, from_quaternion, inverse, log_se3, rotation_angle_deg, to_quaternion
 
 __all__ = [
@@ -126,18 +124,6 @@ class MotionReference:
             UsageError: The file is broken, or holds fewer than two poses.
         """
         return cls(path=read_odometry(file), is_camera=False)
-
-
-def read_odometry(file: Path) -> Trajectory:
-    """Read a path in TUM format, and convert its time stamps to seconds if they have another unit.
-
-    Raises:
-        UsageError: The file is broken, or holds fewer than two poses.
-    """
-    path = read_trajectory(file)
-    if len(path) < 2:
-        raise UsageError(f"{file} holds {len(path)} poses", hint="give a path of 2 poses or more")
-    return Trajectory(stamps_in_seconds(path.timestamps_s, str(file))[0], path.T_world_camera)
 
 
 def nothing_to_compare(*, has_depth: bool) -> list[CannotTell]:

@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags import Bag, BagOptions, is_bag, lens_or_rig, open_bag
+from client_sdk.bag_paths import is_bag
 from client_sdk.datasets import nyu
 from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.images import check_size, probe, probe_size_px, read_colour, read_depth
@@ -43,6 +43,9 @@ from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, Lens
 from rse_pf.storage.files import check_exists, read_regular_file
+
+if TYPE_CHECKING:
+    from client_sdk.bags import Bag
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 
@@ -109,6 +112,8 @@ def open_dataset(
     if scene is None and is_kitti(path):
         return open_kitti(path, camera=camera, imu=imu)
     if scene is None and _is_bag(path):
+        from client_sdk.bags import BagOptions, lens_or_rig, open_bag
+
         use_stereo = None if camera is None else camera == "stereo"
         lens, rig = (None, None) if intrinsics is None else lens_or_rig(Path(intrinsics))
         options = BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)

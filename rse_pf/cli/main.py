@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rse_pf.command_line.extras import error_of_module, is_installed
 from rse_pf.command_line.options import Parser, add_action, add_settings, perform
 from rse_pf.config import load_settings
 from rse_pf.config.validation import did_you_mean
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["VERBS", "main", "parser_of", "verb_module"]
 
-VERBS = {
+_HELP = {
     "demo": "run robots that build point-cloud maps through a platform on this machine",
     "check": "find what is wrong with a drive: calibration, depth, times, images, axes",
     "compare": "compare configurations of the tracker on recordings: errors, bytes, CPU time",
@@ -54,7 +55,7 @@ VERBS = {
     "doctor": "check what this machine needs, and say how to fix it",
     "errors": "explain an error by its code: cause, check, fix",
 }
-"""One line of help for each verb, in the order of the front page."""
+"""One line of help for each verb of this distribution, in the order of the front page."""
 
 _MODULES = {
     "demo": "rse_pf.extensions.experiments.demo.command",
@@ -82,6 +83,9 @@ _MODULES = {
     "errors": "rse_pf.cli.errors",
 }
 """Module of each verb, by name, so that only the module of the verb that runs is imported."""
+
+VERBS = {name: text for name, text in _HELP.items() if is_installed(_MODULES[name].rpartition(".")[0])}
+"""One line of help for each verb; the verbs of extensions that were removed are left out."""
 
 _EXIT_OK = 0
 _EXIT_FAILED = 1
@@ -118,7 +122,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_PIPE
     except ModuleNotFoundError as error:
-        return _report(_missing_extra(error))
+        missing = error_of_module(error.name or "")
+        if missing is None:  # rse-pf has a defect
+            raise
+        return _report(missing)
     except ImportError as error:
         cause = (str(error).splitlines() or [""])[0]
         return _report(
@@ -243,19 +250,6 @@ def _front_page() -> str:
         "rse-pf VERB --help explains a verb; rse-pf --version names the version.\n\n"
         "example:\n  rse-pf demo --out out"
     )
-
-
-def _missing_extra(error: ModuleNotFoundError) -> RsePfError:
-    """Return the error that names the extra of the missing module.
-
-    Raises *error* itself if the module belongs to no extra: then rse-pf has a defect.
-    """
-    from rse_pf.command_line.extras import extra_of_module
-
-    missing = extra_of_module(error.name or "")
-    if missing is None:
-        raise error
-    return missing
 
 
 def _report(error: RsePfError) -> int:

@@ -1,4 +1,4 @@
-"""The extras of this package (``pip install 'rse-pf[EXTRA]'``): modules, purpose, and verbs that need them.
+"""What is installed: the extras of this package (``pip install 'rse-pf[EXTRA]'``), and its extensions.
 
 A test compares the tables with ``pyproject.toml`` and with the verbs of the command line.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from rse_pf.command_line.packages import Defect, find_defect, find_misuse
 from rse_pf.errors import ConfigurationError, MissingExtra
 
-__all__ = ["EXTRAS", "VERBS_NEED", "Extra", "extra_of_module", "modules_of", "require"]
+__all__ = ["EXTRAS", "VERBS_NEED", "Extra", "error_of_module", "is_installed", "modules_of", "require"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,6 +139,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
 }
 """The extras that each verb needs, and those that it needs with some of its actions and options."""
 
+# Packages of this distribution, from which extensions may be removed.
+_OWN = ("rse_pf", "client_sdk", "ros_bridge")
 _OPTIONAL = {"h5py", "yaml"}
 """Modules of extras without which the verbs work: only a file that needs one is refused, with its extra."""
 
@@ -169,9 +171,21 @@ def require(verb: str) -> None:
             raise ConfigurationError(defect.problem, hint=defect.fix)
 
 
-def extra_of_module(module: str) -> MissingExtra | None:
-    """Return the error that names the extra of a missing *module*; None if the module is in no extra."""
+def is_installed(package: str) -> bool:
+    """Return whether *package*, such as ``client_sdk.check``, exists; an extension may have been removed."""
+    try:
+        return importlib.util.find_spec(package) is not None
+    except ModuleNotFoundError:  # the package that contains it is missing
+        return False
+
+
+def error_of_module(module: str) -> ConfigurationError | None:
+    """Return the error about a missing *module* of an extension or an extra; None if it is in neither."""
     top = module.partition(".")[0]
+    if top in _OWN:
+        return ConfigurationError(
+            f"{module} was removed from this installation", hint="install rse-pf again to use this"
+        )
     return next(_missing_extras(top), None)
 
 

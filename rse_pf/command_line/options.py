@@ -12,6 +12,7 @@ An `Action` is a verb, or one action of a verb; it names the request and the fun
 from __future__ import annotations
 
 import argparse
+import importlib
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,10 +20,11 @@ from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rse_pf.command_line.extras import is_installed
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import UsageError
 
-__all__ = ["Action", "NoOptions", "Parser", "add_action", "option", "perform"]
+__all__ = ["Action", "NoOptions", "Parser", "add_action", "extension_actions", "option", "perform"]
 
 _CONVERTERS: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Path": Path}
 """Function that converts the text of an option, by the first type name in the annotation of its field.
@@ -53,6 +55,15 @@ class Action:
     run: Callable[[Any, Any], int | None] | None = None
     actions: Mapping[str, Action] = field(default_factory=dict)
     default: str = ""
+
+
+def extension_actions(**modules: str) -> dict[str, Action]:
+    """Return the ``ACTION`` of each module, by name; those of removed extensions are left out."""
+    return {
+        name: importlib.import_module(module).ACTION
+        for name, module in modules.items()
+        if is_installed(module.rpartition(".")[0])
+    }
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ __all__ = [
     "platform_settings",
     "read_state",
     "recording_key_file",
+    "remove_keys",
     "remove_state",
     "settings_file",
     "state_file",
@@ -222,6 +223,13 @@ def read_state(folder: Path) -> PlatformState | None:
 def remove_state(folder: Path) -> None:
     """Remove the state file in *folder*, if it exists; keys and logs stay."""
     (folder / _FILE).unlink(missing_ok=True)
+
+
+def remove_keys(folder: Path) -> None:
+    """Delete the signing keys of a stopped platform and of its live maps in *folder*."""
+    for pattern in ("key*.json", "objects/live/key=*"):
+        for file in folder.glob(pattern):
+            file.unlink()
 
 
 def stop_platform(folder: Path, timeout_s: float = STOP_TIMEOUT_S) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,19 +23,9 @@ from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.terminal import printable
-from rse_pf.wire import Failure
-from tests.kit.recorded_sessions import Made
+from tests.kit.hostile_text import HOSTILE, obeyed
 
-HOSTILE = (
-    "r\x1b[2J\x1b]52;c;eA==\x07\x9b31m\u202e\u2066\u200b\ufeff\r\nok: forged\x85\u2028\x00\x7f\U000e0041"
-)
 NAME = HOSTILE[:60]
-
-
-def obeyed(text: str) -> set[str]:
-    """Return what a terminal would obey or hide in *text*, apart from the newlines that end lines."""
-    hidden = {"Cc", "Cf", "Cs", "Co", "Zl", "Zp"}
-    return {letter for letter in text if unicodedata.category(letter) in hidden and letter != "\n"}
 
 
 def hostile_map(keyframes: int = 2) -> bytes:
@@ -76,9 +65,6 @@ def place(platform: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         name="default", control_plane=gone, url=f"ws://{HOSTILE}/ws", settings_digest="", settings_file="",
         key_file="", servers=(ServerState(name=HOSTILE, process=gone),),
     ).write(platform)  # fmt: skip
-    made = Made(platform / "recording", server=HOSTILE)
-    made.send(1, answer=Failure(id=0, code=HOSTILE, message=HOSTILE, hint=HOSTILE), trace=HOSTILE[:64])
-    made.close()
     stranger = token({"sub": HOSTILE, "jti": HOSTILE, "exp": 4e9})
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{stranger}\n"))
     return platform
@@ -126,7 +112,6 @@ CASES: list[Callable[[Path], tuple[str, ...]]] = [
     lambda place: ("service", "new", HOSTILE),
     lambda place: ("experiment", "verify", str(place)),
     lambda place: ("replay", HOSTILE),
-    lambda place: ("replay", str(place / "recording")),
     lambda place: (HOSTILE,),
     lambda place: ("map", HOSTILE),
 ]  # fmt: skip

@@ -28,6 +28,7 @@ from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
 from tests.kit.documentation_pages import PAGES
+from tests.kit.removed_extensions import is_removed
 
 OTHER_PROGRAMS = (
     "npx", "node", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
@@ -65,6 +66,8 @@ def complaint(repository: Path, command: str) -> str:
         )
     if first != "rse-pf":
         return "" if first in OTHER_PROGRAMS else "no program of ours"
+    if is_removed(" ".join(words)):
+        return ""
     if not words or words[0] not in VERBS:
         return "no verb"
     try:
@@ -79,6 +82,8 @@ def complaint(repository: Path, command: str) -> str:
 def half_a_complaint(command: str) -> str:
     """Return what is wrong with a command of which a sentence names a part only."""
     _, verb, *words = shlex.split(command)
+    if is_removed(" ".join((verb, *words))):
+        return ""
     if verb not in VERBS:
         return "no verb"
     parser = parser_of(verb)

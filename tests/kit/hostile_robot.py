@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from rse_pf.extensions.experiments.results.trajectory_error import ate_m
+from client_sdk.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3
 from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured
 from rse_pf.live_map.live_map import LiveMap

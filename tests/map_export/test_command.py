@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from rse_pf.cli.main import main
+from rse_pf.geometry import Camera
 from rse_pf.maps.describe import MapSummary
-from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
 from rse_pf.storage.object_store import DirectoryStore, digest_of
 from tests.kit.exact_maps import points_map
@@ -205,3 +206,32 @@ def absurd_points(version: MapVersion) -> bytes:
     points = np.frombuffer(text["points"], dtype="<f4").copy()
     points[0] = 1e30
     return data[:8] + zlib.compress(msgspec.msgpack.encode({**text, "points": points.tobytes()}))
+
+
+def test_a_version_of_a_map_is_exported_as_mcap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bags = pytest.importorskip("client_sdk.bags.bag_file", reason="the extension was removed")
+    pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")
+    monkeypatch.chdir(tmp_path)
+    camera = Camera(fx=1, fy=1, cx=1, cy=1, width=2, height=2)
+    keyframes = [
+        Keyframe(
+            id=row, robot="a", timestamp_s=float(row), camera=camera, T_world_camera=np.eye(4),
+            pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
+            points_camera=np.zeros((0, 3), np.float32),
+        )
+        for row in (1, 2)
+    ]  # fmt: skip
+    version = MapVersion(
+        keyframes=tuple(keyframes), edges=(), points=np.zeros((4, 3), np.float32),
+        colours=np.zeros((4, 3), np.uint8),
+    )  # fmt: skip
+    MapRegistry(DirectoryStore(tmp_path / "store")).commit(
+        "hall", encode_map(version), parent=None, author="t", created_s=1.0
+    )
+
+    for _ in range(2):  # the second one replaces the first
+        words = ["--format", "mcap", "--out", "h.mcap", "--store", "dir:store"]
+        assert main(["map", "export", "hall", *words]) == 0
+
+    with bags.open_bag_file(Path("h.mcap")) as bag:
+        assert {topic.name for topic in bag.topics} == {"/a/pose", "/a/path", "/tf", "/map"}

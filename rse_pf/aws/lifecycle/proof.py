@@ -1,4 +1,4 @@
-"""Check that a deployment was removed: list the resources that AWS still has with its tag, and their costs.
+"""Check that a deployment was removed: list the resources that AWS still has with its tag.
 
 The check does not rely on the stacks: it reads AWS's tagging service, and finds resources without tags by
 their names.
@@ -36,13 +36,11 @@ class KeptResource:
         kind: ``bucket`` or ``secret``.
         name: Name of the resource.
         gb: Size of a bucket in GB, which AWS measures once a day; None before the first measurement.
-        per_month: Cost of a month; of a bucket without a measurement, 0.
     """
 
     kind: str
     name: str
     gb: float | None
-    per_month: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,27 +50,13 @@ class Proof:
     kept: tuple[KeptResource, ...]
     left: tuple[str, ...]
 
-    @property
-    def per_month(self) -> float:
-        """Return the cost of a month of all kept resources; buckets that are not measured yet count 0."""
-        return sum(each.per_month for each in self.kept)
 
-
-def prove(
-    account: Account,
-    names: ResourceNames,
-    *,
-    gb_month_price: float,
-    secret_month_price: float,
-    now: datetime,
-) -> Proof:
+def prove(account: Account, names: ResourceNames, *, now: datetime) -> Proof:
     """Return the resources of a deployment that still exist; raises the errors of `Account.find`.
 
     Args:
         account: AWS account of the deployment.
         names: Names of its resources.
-        gb_month_price: Price of a GB in S3 for a month.
-        secret_month_price: Price of a secret for a month.
         now: The time in UTC.
     """
     tagged = _list_tagged(account, names)
@@ -85,12 +69,11 @@ def prove(
         for leftover in find_leftovers(account, names)
         if leftover.kind not in _KEPT_KINDS.values() and not any(leftover.name in arn for arn in tagged)
     }
-    resources = []
-    for kind, name in kept_names:
-        gb = _gigabytes(account, name, now) if kind == "bucket" else 0.0
-        price = gb_month_price * (gb or 0.0) if kind == "bucket" else secret_month_price
-        resources.append(KeptResource(kind=kind, name=name, gb=gb, per_month=price))
-    return Proof(kept=tuple(resources), left=tuple(sorted(remaining)))
+    kept = (
+        KeptResource(kind=kind, name=name, gb=_gigabytes(account, name, now) if kind == "bucket" else 0.0)
+        for kind, name in kept_names
+    )
+    return Proof(kept=tuple(kept), left=tuple(sorted(remaining)))
 
 
 def _list_tagged(account: Account, names: ResourceNames) -> set[str]:

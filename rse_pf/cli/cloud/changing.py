@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
 from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.plan import Step
+from rse_pf.command_line.extras import is_installed
 from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.extensions.costs.bill import HOURS, Bill, bill_of, parked
-from rse_pf.extensions.costs.prices import Prices, operators_prices
 from rse_pf.terminal import show
+
+if TYPE_CHECKING:
+    from rse_pf.extensions.costs.deployment import DeploymentCosts
 
 __all__ = [
     "ChangeRequest",
-    "DeploymentCosts",
     "confirmed",
     "deployment_costs",
     "make_tools",
     "open_world",
     "perform",
+    "show_costs",
     "show_steps",
 ]
 
@@ -39,36 +41,30 @@ class ChangeRequest:
     yes: bool = option("--yes", help="do not ask for a confirmation")
 
 
-class DeploymentCosts:
-    """The costs of a deployment without robots: running, parked, and deeply parked (``deep``)."""
-
-    def __init__(self, settings: PlatformSettings, prices: Prices) -> None:
-        self.prices = prices
-        self.running = bill_of(settings, prices)
-        self.parked, self.deep = (parked(self.running, deep=deep) for deep in (False, True))
-
-    def line(self, bill: Bill) -> str:
-        """Return the total of *bill* as words: its price an hour and a month."""
-        money = self.prices.currency
-        return f"{bill.total / HOURS:.2f} {money} an hour, {bill.total:.0f} {money} a month"
-
-    def server_per_hour(self, settings: PlatformSettings) -> float:
-        """Return the price of one more backend server for an hour, in the currency of the prices."""
-        return self.prices.server(settings.cloud.instance_type).per_hour
-
-    def warnings(self, settings: PlatformSettings) -> list[str]:
-        """Return the warnings about the prices, for example that they are old or of another region."""
-        today = datetime.now(timezone.utc).date()
-        return self.prices.warnings(today=today, region=settings.cloud.region)
-
-
-def deployment_costs(settings: PlatformSettings) -> DeploymentCosts:
+def deployment_costs(settings: PlatformSettings) -> DeploymentCosts | None:
     """Return the costs of the deployment of *settings*, by the operator's prices in the working folder.
+
+    None if the extension was removed.
 
     Raises:
         ConfigurationError: The prices lack the type of the EC2 instances.
     """
+    if not is_installed("rse_pf.extensions.costs"):
+        return None
+    from rse_pf.extensions.costs.deployment import DeploymentCosts
+    from rse_pf.extensions.costs.prices import operators_prices
+
     return DeploymentCosts(settings, operators_prices(None, Path.cwd()))
+
+
+def show_costs(settings: PlatformSettings, lines: Callable[[DeploymentCosts], Iterable[str]]) -> None:
+    """Print *lines* about the costs of the deployment, and warnings about the prices.
+
+    Nothing is printed if the extension was removed.
+    """
+    costs = deployment_costs(settings)
+    if costs is not None:
+        show(*lines(costs), *costs.warnings(settings))
 
 
 def make_tools(account: Account, settings: PlatformSettings, request: ChangeRequest) -> CdkTools:

@@ -5,7 +5,6 @@ examples:
   rse-pf cloud park --deep
   rse-pf cloud down
   rse-pf cloud doctor
-  rse-pf cloud cost --robots 20 --fps 5 --hours-per-day 8
   rse-pf cloud status
   rse-pf cloud leftovers
 """
@@ -14,7 +13,6 @@ from __future__ import annotations
 
 from rse_pf.cli.cloud import (
     canary,
-    cost,
     doctor,
     down,
     leftovers,
@@ -25,7 +23,7 @@ from rse_pf.cli.cloud import (
     up,
     upgrade,
 )  # fmt: skip
-from rse_pf.command_line.options import Action
+from rse_pf.command_line.options import Action, extension_actions
 
 __all__ = ["ACTION"]
 
@@ -37,7 +35,7 @@ ACTION = Action(
         "resume": resume.ACTION,
         "down": down.ACTION,
         "doctor": doctor.ACTION,
-        "cost": cost.ACTION,
+        **extension_actions(cost="rse_pf.extensions.costs.command"),
         "status": status.ACTION,
         "logs": logs.ACTION,
         "canary": canary.ACTION,

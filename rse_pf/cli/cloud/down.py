@@ -49,15 +49,16 @@ def take_down(request: DownRequest, settings: PlatformSettings) -> int:
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
     plan = plan_down(read_deployment(account, settings), delete_data=request.delete_data)
     changing.show_steps(plan)
-    costs = changing.deployment_costs(settings)
-    show(f"it cost {costs.line(costs.running)}, and more with robots", *costs.warnings(settings))
-    _show_kept(_prove(account, names, costs), is_over=False)
+    changing.show_costs(
+        settings, lambda costs: [f"it cost {costs.line(costs.running)}, and more with robots"]
+    )
+    _show_kept(prove(account, names, now=datetime.now(timezone.utc)), settings, is_over=False)
     if not changing.confirmed(request) or (request.delete_data and not _confirmed_twice(request, names)):
         return 1
     tools = changing.make_tools(account, settings, request)
     changing.perform(plan, changing.open_world(account, settings, tools))
-    proof = _last_proof(account, names, costs)
-    _show_kept(proof, is_over=True)
+    proof = _last_proof(account, names)
+    _show_kept(proof, settings, is_over=True)
     for name in proof.left:
         show(f"LEFT OVER  {name}")
     show(f"{len(proof.left)} left over, {counted(len(proof.kept), 'resource')} kept on purpose")
@@ -86,41 +87,33 @@ def _confirmed_twice(request: DownRequest, names: ResourceNames) -> bool:
     return sys.stdin.readline().strip() == names.prefix
 
 
-def _prove(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
-    """Return which resources of the deployment exist now: kept on purpose, with their costs, or left over."""
-    return prove(
-        account, names, gb_month_price=costs.prices.stored_per_gb_month,
-        secret_month_price=costs.prices.secret_per_month, now=datetime.now(timezone.utc),
-    )  # fmt: skip
-
-
-def _last_proof(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
+def _last_proof(account: Account, names: ResourceNames) -> Proof:
     """Return the resources that remain, once AWS lists none as left over or after `_LISTED_LATE_S`."""
     deadline = time.monotonic() + _LISTED_LATE_S
     while True:
-        proof = _prove(account, names, costs)
+        proof = prove(account, names, now=datetime.now(timezone.utc))
         if not proof.left or time.monotonic() > deadline:
             return proof
         time.sleep(_POLL_S)
 
 
-def _show_kept(proof: Proof, *, is_over: bool) -> None:
-    """Print the resources that are kept on purpose, with size and monthly cost.
+def _show_kept(proof: Proof, settings: PlatformSettings, *, is_over: bool) -> None:
+    """Print the resources that are kept on purpose, with size and, by the extension, monthly cost.
 
     *is_over* is whether the deployment is destroyed already; it only changes the words.
     """
+    costs, together = changing.deployment_costs(settings), 0.0
+    verb = "kept" if is_over else "there is"
     for resource in proof.kept:
-        size = (
-            ""
-            if resource.kind != "bucket"
-            else "  not measured yet"
-            if resource.gb is None
-            else f"  {resource.gb:.2f} GB"
-        )
-        verb = "kept" if is_over else "there is"
-        show(f"{verb}  {resource.kind}  {resource.name}{size}, {resource.per_month:.2f} a month")
-    if proof.kept:
-        show(f"together {proof.per_month:.2f} a month")
+        size = price = ""
+        if resource.kind == "bucket":
+            size = "  not measured yet" if resource.gb is None else f"  {resource.gb:.2f} GB"
+        if costs is not None:
+            per_month = costs.kept_per_month(resource.kind, resource.gb)
+            price, together = f", {per_month:.2f} a month", together + per_month
+        show(f"{verb}  {resource.kind}  {resource.name}{size}{price}")
+    if proof.kept and costs is not None:
+        show(f"together {together:.2f} a month")
 
 
 ACTION = Action(

@@ -37,12 +37,17 @@ def park(request: ParkRequest, settings: PlatformSettings) -> int:
         show("the platform is parked; rse-pf cloud resume ends that")
         return 0
     changing.show_steps(plan)
-    costs = changing.deployment_costs(settings)
     here = {False: "<- this", True: ""}
-    show(f"up costs             {costs.line(costs.running)}")
-    show(f"parked costs         {costs.line(costs.parked)}; back in about 2 minutes  {here[request.deep]}")
-    show(f"parked --deep costs  {costs.line(costs.deep)}; back in about 10 minutes  {here[not request.deep]}")
-    show("stored maps and logs are not in these prices", *costs.warnings(settings))
+    changing.show_costs(
+        settings,
+        lambda costs: [
+            f"up costs             {costs.line(costs.running)}",
+            f"parked costs         {costs.line(costs.parked)}; back in about 2 minutes  {here[request.deep]}",
+            f"parked --deep costs  {costs.line(costs.deep)}; back in about 10 minutes  "
+            f"{here[not request.deep]}",
+            "stored maps and logs are not in these prices",
+        ],
+    )
     if settings.scaling.schedule.strip() and not request.deep:
         show("the next entry of scaling.schedule that does not lower the minimum resumes it")
     if not changing.confirmed(request):

@@ -27,8 +27,9 @@ def resume(request: changing.ChangeRequest, settings: PlatformSettings) -> int:
     if is_deep and up.show_failed_checks(account, settings):
         return 1
     changing.show_steps(plan)
-    costs = changing.deployment_costs(settings)
-    show(f"it then costs {costs.line(costs.running)}, and more with robots", *costs.warnings(settings))
+    changing.show_costs(
+        settings, lambda costs: [f"it then costs {costs.line(costs.running)}, and more with robots"]
+    )
     if not changing.confirmed(request):
         return 1
     changing.perform(plan, changing.open_world(account, settings, tools))

@@ -9,7 +9,6 @@ from rse_pf.cli.cloud import changing
 from rse_pf.command_line.options import Action, NoOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
-from rse_pf.extensions.costs.bill import HOURS
 from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
@@ -56,18 +55,14 @@ def show_status(request: NoOptions, settings: PlatformSettings) -> int:
 
 def _show_stage(deployment: Deployment, settings: PlatformSettings) -> None:
     """Print the stage of the deployment, its costs an hour without robots, and its address if it has one."""
-    costs, note = changing.deployment_costs(settings), deployment.note
+    note = deployment.note
     name = ResourceNames(settings.cloud.name).prefix
     parked_by = f", by the {note.by} since {note.since}: rse-pf cloud resume" if note is not None else ""
     show(f"{name} in {settings.cloud.region}: {deployment.stage}{parked_by}")
-    bills = {"up": costs.running, "incomplete": costs.running, "parked": costs.parked}
-    if deployment.stage in bills:
+    costs = changing.deployment_costs(settings)
+    if costs is not None:
         servers = sum(group.instances for group in deployment.groups.values())
-        more = max(0, servers - settings.scaling.min_servers)
-        hourly = bills[deployment.stage].total / HOURS + more * costs.server_per_hour(settings)
-        show(f"costs {hourly:.2f} {costs.prices.currency} an hour now, plus robots' requests and stored data")
-    else:
-        show("costs nothing but stored data: rse-pf cloud down lists it")
+        show(costs.line_now(settings, deployment.stage, servers))
     if deployment.url and note is None:
         show(deployment.url)
 

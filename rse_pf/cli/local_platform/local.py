@@ -51,7 +51,7 @@ from rse_pf.cli.local_platform.logs import (
     log_files,
     since_time_s,
 )
-from rse_pf.command_line.extras import require
+from rse_pf.command_line.extras import is_installed, require
 from rse_pf.command_line.options import Action, option
 from rse_pf.config import HealthSettings, PlatformSettings
 from rse_pf.config.resource_names import ROBOTS_PATH, ROSBRIDGE_PATH
@@ -243,10 +243,11 @@ def start(request: _StartRequest, settings: PlatformSettings) -> int:
     burst_port = None if request.burst is None else request.burst or _BURST_PORT
     if burst_port is not None:
         chosen = _with_burst(chosen, burst_port, lan)
+    has_page = not request.no_page and is_installed("rse_pf.extensions.fleet_page")
     return asyncio.run(
         _foreground(
             request.name, folder, chosen, data=not request.no_data, lan=lan,
-            extras=_Extras(page=not request.no_page, burst_port=burst_port),
+            extras=_Extras(page=has_page, burst_port=burst_port),
         )
     )  # fmt: skip
 
@@ -312,7 +313,7 @@ def show_status(request: _StatusRequest, settings: PlatformSettings) -> None:
 
 def kill_balancer(request: PlatformRequest, settings: PlatformSettings) -> None:
     """Kill the load balancer of a platform; its control plane starts another one."""
-    from rse_pf.extensions.experiments.faults import faults
+    from rse_pf.local import faults
 
     show(f"killed the load balancer (pid {faults.kill_balancer(request.read_state())})")
 
@@ -329,7 +330,7 @@ def resume(request: _ServerRequest, settings: PlatformSettings) -> None:
 
 def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
     """Send SIGSTOP to all processes of a server, and with --for continue them after that time or Ctrl-C."""
-    from rse_pf.extensions.experiments.faults import faults
+    from rse_pf.local import faults
 
     state = request.read_state()
     server = faults.find_server(state, request.server)
@@ -346,7 +347,7 @@ def pause(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
     """Slow a server down to --percent of its CPU time, until the time of --for is over or Ctrl-C."""
-    from rse_pf.extensions.experiments.faults import faults
+    from rse_pf.local import faults
 
     server = faults.find_server(request.read_state(), request.server)
     wait = request.waiter()
@@ -357,7 +358,7 @@ def slow(request: _SlowRequest, settings: PlatformSettings) -> None:
 
 def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
     """Cut a server off from the network, until the time of --for is over or Ctrl-C."""
-    from rse_pf.extensions.experiments.faults import faults
+    from rse_pf.local import faults
 
     server = faults.find_server(request.read_state(), request.server)
     wait = request.waiter()
@@ -369,7 +370,7 @@ def partition(request: _FaultRequest, settings: PlatformSettings) -> None:
 
 def _signal(request: _ServerRequest, number: signal.Signals, done: str) -> None:
     """Send signal *number* to all processes of the server; print *done* and how many processes these are."""
-    from rse_pf.extensions.experiments.faults import faults
+    from rse_pf.local import faults
 
     server = faults.find_server(request.read_state(), request.server)
     count = faults.signal_tree(server.process, number)

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rse_pf.cli.maps.from_camera import DriveRequest, check_drive, errors_of, map_source
+from rse_pf.cli.maps.from_camera import DriveRequest, check_drive, errors_of, map_source, truth_reference
 from rse_pf.command_line.extras import require
 from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
@@ -23,9 +22,8 @@ from rse_pf.terminal import at_work, counted, show
 if TYPE_CHECKING:
     from client_sdk.bags import BagKind, BagOptions
     from client_sdk.trajectory import Trajectory
-    from rse_pf.maps.format import MapVersion
 
-__all__ = ["FromBagRequest", "ToBagRequest", "export_bag", "run_from_bag", "run_to_bag"]
+__all__ = ["FromBagRequest", "ToBagRequest", "run_from_bag", "run_to_bag"]
 
 # Format of a bag by the ending of its file name.
 _ENDINGS: dict[str, BagKind] = {".bag": "ros1", ".db3": "sqlite3", ".mcap": "mcap"}
@@ -105,7 +103,6 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
     options = _options(request)
     from client_sdk.bags import open_bag
     from client_sdk.cameras import source_of_frames
-    from client_sdk.check.motion import MotionReference
     from client_sdk.datasets.recordings import dataset_of_bag
 
     with at_work(f"reading {request.source}"):
@@ -144,7 +141,7 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
                 **errors_of(path, bag.truth, bag.truth_kind),
             }
 
-        reference = MotionReference.of_truth(bag.truth, bag.truth_kind, is_camera=False)
+        reference = truth_reference(request, bag.truth, bag.truth_kind, is_camera=False)
         return map_source(request, settings, source, scale, about, reference)
 
 
@@ -172,30 +169,6 @@ def run_to_bag(request: ToBagRequest, settings: PlatformSettings) -> int:
     show(f"{request.out}: {counted(messages, 'message')}, {counted(len(points), 'point')}, "
          f"{counted(len(paths), 'path')}")  # fmt: skip
     return 0
-
-
-def export_bag(file: Path, version: MapVersion) -> int:
-    """Write *version* of a map as the MCAP *file*, which ROS 2 and Foxglove read; return its size in bytes.
-
-    It holds the path of each robot's keyframes, and the points with colours.
-
-    Raises:
-        MissingExtra: ``rosbags`` is not installed.
-    """
-    require("map to-bag")
-    from client_sdk.bags import write_map_bag
-    from client_sdk.trajectory import Trajectory
-
-    paths = []
-    for robot in sorted({keyframe.robot for keyframe in version.keyframes}):
-        own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
-        poses = np.stack([k.T_world_camera for k in own])
-        paths.append((robot, Trajectory(np.array([k.timestamp_s for k in own]), poses)))
-    with TemporaryDirectory(prefix=".export-", dir=file.absolute().parent) as folder:
-        bag = Path(folder) / "map.mcap"
-        write_map_bag(bag, "mcap", paths, version.points, version.colours)
-        bag.replace(file)
-    return file.stat().st_size
 
 
 def _options(request: FromBagRequest) -> BagOptions:

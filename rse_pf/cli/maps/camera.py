@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from client_sdk.bag_paths import BAG_ENDINGS
 from rse_pf.cli.maps.frame_table import named_frames
 from rse_pf.command_line.extras import require
 from rse_pf.command_line.options import Action, option
@@ -132,7 +133,7 @@ def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> 
     if not request.file.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {request.file.absolute().parent}", hint="create it")
     for source in request.sources:
-        is_bag = Path(source).suffix in (".bag", ".mcap", ".db3")
+        is_bag = Path(source).suffix in BAG_ENDINGS
         if is_bag or (source == "realsense" and is_device(source)):
             verb = "map from-bag" if is_bag else "map from-camera"
             raise UsageError(
@@ -350,7 +351,7 @@ def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], str]]:
     if path.is_dir() and not has_pairs and not is_recording(path) and not (path / "rgb.txt").exists():
         images = list_folder(path).frames(DoubtLog(), 1000.0)
         yield from ((stamp, rgb, "" if depth_m is None else "depth") for stamp, rgb, depth_m in images)
-    elif source == "realsense" or path.is_dir() or path.suffix in (".bag", ".mat", ".mcap", ".db3"):
+    elif source == "realsense" or path.is_dir() or path.suffix in (*BAG_ENDINGS, ".mat"):
         with open_camera(source) as frames:
             for frame in frames:
                 by_depth = "depth" if frame.depth_m.any() else ""

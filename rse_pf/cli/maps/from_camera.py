@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 from urllib.parse import urlsplit
 
-from client_sdk.check.drive_check import DriveCheck
 from client_sdk.source_facts import check_accepted, ended_early, unresolved
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.cli.maps.keyframe_images import KeyframeImages
+from rse_pf.command_line.drive_output import accuracy_lines, lost_line, offset_lines
+from rse_pf.command_line.extras import is_installed
 from rse_pf.command_line.map_store import KeepRequest, drive_store, keep_map, map_name
 from rse_pf.command_line.options import option
 from rse_pf.command_line.sensors import CheckRequest, SensorRequest, show_source
@@ -34,6 +35,7 @@ from rse_pf.terminal import show, show_progress
 if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
     from client_sdk.cameras.source import FrameSource
+    from client_sdk.check.drive_check import DriveCheck
     from client_sdk.check.motion import MotionReference
     from client_sdk.datasets import Dataset
     from client_sdk.frontend import Frame
@@ -41,7 +43,15 @@ if TYPE_CHECKING:
     from client_sdk.trajectory import Trajectory
     from rse_pf.geometry import Array
 
-__all__ = ["DriveRequest", "FromCameraRequest", "check_drive", "errors_of", "map_source", "run_from_camera"]
+__all__ = [
+    "DriveRequest",
+    "FromCameraRequest",
+    "check_drive",
+    "errors_of",
+    "map_source",
+    "run_from_camera",
+    "truth_reference",
+]
 
 # Name of the robot in the map and its picture.
 _ROBOT = "camera"
@@ -120,22 +130,23 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
     """
     scale = check_drive(request)
     from client_sdk.cameras import open_camera
-    from client_sdk.check.motion import MotionReference, read_odometry
+    from client_sdk.trajectory import read_odometry
 
     recording = _recording(request)
     reference = None
     kind, _, scale_file = (request.scale or "").partition(":")
     odometries = [Path(scale_file)] if kind == "odometry" else []
-    if request.check:
+    if _is_checked(request):
+        from client_sdk.check.motion import MotionReference
+
         try:
             reference = MotionReference.of_folder(request.source)
             if reference is not None:
                 odometries.append(Path(request.source) / "odometry.txt")
         except UsageError as error:
             show(f"note: {error}: it is not compared with the motion", error=True)
-    if recording is not None and request.check:
-        truth = MotionReference.of_truth(recording.truth, recording.truth_kind)
-        reference = truth or reference
+    if recording is not None:
+        reference = truth_reference(request, recording.truth, recording.truth_kind) or reference
 
     def about(path: Trajectory) -> dict[str, Any]:
         """Return the errors of *path* for the report; empty if the source states no true poses."""
@@ -167,6 +178,22 @@ def _recording(request: FromCameraRequest) -> Dataset | None:
     return open_dataset(path, camera=request.camera, imu=request.imu, intrinsics=request.intrinsics)
 
 
+def _is_checked(request: DriveRequest) -> bool:
+    """Return whether the drive is checked: it is wanted, and the extension was not removed."""
+    return request.check and is_installed("client_sdk.check")
+
+
+def truth_reference(
+    request: DriveRequest, truth: Trajectory | None, kind: str, *, is_camera: bool = True
+) -> MotionReference | None:
+    """Return `MotionReference.of_truth` of the arguments; None if the drive is not checked."""
+    if not _is_checked(request):
+        return None
+    from client_sdk.check.motion import MotionReference
+
+    return MotionReference.of_truth(truth, kind, is_camera=is_camera)
+
+
 def errors_of(
     path: Trajectory, truth: Trajectory | None, kind: str, T_body_camera: Array | None = None
 ) -> dict[str, Any]:
@@ -178,7 +205,7 @@ def errors_of(
         kind: What *truth* is, in words of the report.
         T_body_camera: Maps camera to body; with it the poses of the body are compared.  None: of the camera.
     """
-    from rse_pf.extensions.experiments.results.trajectory_error import trajectory_figures
+    from client_sdk.trajectory_error import trajectory_figures
 
     return {"truth": kind, **trajectory_figures(path, truth, T_body_camera)}
 
@@ -212,18 +239,22 @@ def map_source(
             f"{request.source} has {what}, so that its scale is known",
             hint=f"leave out --scale, or add {option}",
         )
-    from rse_pf.extensions.experiments.results.markdown import lost_line
     from rse_pf.maps.map_image import RobotPath, draw_map
 
     _make_folder(request.out)
     kept_in = drive_store(request.objects, settings)
     frames = FrameTable()
     images = KeyframeImages(request.out) if request.keep_images else None
-    check = DriveCheck(is_wanted=request.check, is_thinned=request.rate is not None)
+    check: DriveCheck | None = None
+    if _is_checked(request):
+        from client_sdk.check.drive_check import DriveCheck
+
+        check = DriveCheck(is_thinned=request.rate is not None)
 
     def watch(frame: Frame, tracked: TrackedFrame) -> None:
         """Check a tracked frame, and write its image if it is a keyframe."""
-        check.add(frame, tracked)
+        if check is not None:
+            check.add(frame, tracked)
         if images is not None:
             images.add(tracked)
 
@@ -234,9 +265,7 @@ def map_source(
         source.log.add(ended_early(failed, mapper.frames))
     doubts = unresolved(source.log.doubts, request.accept)
     report = {**mapper.save(request.out), "assumed": list(source.notes)}
-    checked = check.finish(
-        reference, mapper.adjust_pairs() if check.is_wanted else None, doubts, request.accept
-    )
+    checked = None if check is None else check.finish(mapper, reference, doubts, request.accept)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if report["unit"] != "m" and report.get("ate_cm") is not None:
@@ -267,7 +296,7 @@ def map_source(
         *frames.lines(),
         *([f"the IMU is {report['imu']}"] if str(report.get("imu") or "").startswith("not") else []),
         *([] if request.check else [line for doubt in doubts if (line := doubt.line()) not in shown]),
-        *check.lines(checked, shown),
+        *(check.lines(checked, shown) if check is not None and checked is not None else []),
         f"results: {request.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
         kept_line,
     )
@@ -283,28 +312,6 @@ def map_source(
             hint=_advice(mapper, source, check, findings),
         )
     return 0
-
-
-def offset_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the line about an offset of the disparity that was corrected when a stereo drive was saved.
-
-    An empty list if none was found.
-    """
-    offset_px, deviation_px = (report.get(f"disparity_offset{each}_px") for each in ("", "_deviation"))
-    if not offset_px:
-        return []
-    return [
-        f"the calibration lacks {offset_px:.2f} +- {deviation_px:.2f} px of disparity: saving corrected "
-        "path, keyframes and cloud; check speaks of the drive before that"
-    ]
-
-
-def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the line with ATE and RPE (cm) of *report*; an empty list without true poses or metric scale."""
-    if report.get("ate_cm") is None:
-        return []
-    rpe = "" if report["rpe_cm"] is None else f", RPE {report['rpe_cm']:.2f} cm"
-    return [f"error beside the {report['truth']}: ATE {report['ate_cm']:.2f} cm{rpe}"]
 
 
 def _keep(
@@ -370,7 +377,7 @@ def _scale(word: str | None) -> OdometryScale | MarkerScale | None:
         UsageError: *word* has another form, or the file cannot be read.
     """
     from client_sdk import MarkerScale, OdometryScale
-    from client_sdk.check.motion import read_odometry
+    from client_sdk.trajectory import read_odometry
 
     if word is None:
         return None
@@ -459,8 +466,8 @@ async def _robot(request: DriveRequest, settings: PlatformSettings) -> AsyncIter
         async with connect(list(request.url), token=token, settings=settings.session) as robot:
             yield robot
     else:
-        from rse_pf.extensions.experiments.results.result_folder import remove_keys
         from rse_pf.local.control.platform import LocalPlatform
+        from rse_pf.local.state import remove_keys
 
         folder = request.out / "platform"
         show("starting the platform: Envoy and backend servers")
@@ -506,14 +513,14 @@ class _Status:
 
 
 def _advice(
-    mapper: Mapper, source: FrameSource, check: DriveCheck, findings: Sequence[Mapping[str, Any]]
+    mapper: Mapper, source: FrameSource, check: DriveCheck | None, findings: Sequence[Mapping[str, Any]]
 ) -> str:
     """Return the hint about frames without a pose.
 
     It names the cause that *check* sees in the images, else the first of *findings*, else a cause that
     follows from the sensors of *source*.
     """
-    cause = check.cause_of_loss()
+    cause = None if check is None else check.cause_of_loss()
     if cause is not None:
         return cause
     if findings:

@@ -19,8 +19,6 @@ examples:
   rse-pf map backup acme.maps --tenant acme --name lab
   rse-pf map restore acme.maps --tenant acme --name lab
   rse-pf map prune kitchen --keep 10
-  rse-pf map export kitchen --format ply --out kitchen.ply
-  rse-pf map export kitchen --format occupancy --out kitchen-plan
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.cli.maps.backup import BackupRequest, RestoreRequest, run_backup, run_restore
-from rse_pf.cli.maps.bags import FromBagRequest, ToBagRequest, export_bag, run_from_bag, run_to_bag
+from rse_pf.cli.maps.bags import FromBagRequest, ToBagRequest, run_from_bag, run_to_bag
 from rse_pf.cli.maps.from_camera import FromCameraRequest, run_from_camera
 from rse_pf.cli.maps.live import LIVE_ACTIONS, run_publish
 from rse_pf.cli.maps.localise import LocaliseRequest, run_localise
@@ -48,10 +46,9 @@ from rse_pf.command_line.map_store import (
     split_version,
 )
 from rse_pf.command_line.merge_output import commit_merge, merge_progress
-from rse_pf.command_line.options import Action, option
+from rse_pf.command_line.options import Action, extension_actions, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.extensions.map_export.command import ExportRequest, run_export
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, compare_versions
 from rse_pf.maps.removal import choose_superseded, count_freed_bytes
 from rse_pf.terminal import at_work, counted, format_time
@@ -338,12 +335,7 @@ ACTION = Action(
             request=_PruneRequest,
             run=_prune,
         ),
-        "export": Action(
-            help="write a version in the format of another program",
-            example="rse-pf map export kitchen --format colmap --out kitchen-colmap",
-            request=ExportRequest,
-            run=functools.partial(run_export, write_bag=export_bag),
-        ),
+        **extension_actions(export="rse_pf.extensions.map_export.command"),
         "backup": Action(
             help="write all maps of a tenant into one file",
             example="rse-pf map backup acme.maps --tenant acme",

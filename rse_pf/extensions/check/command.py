@@ -139,7 +139,7 @@ def _checked(
 
     A path that is no recording and no bag is opened as a camera, a video or a folder of images.
     """
-    from client_sdk.bags import is_bag
+    from client_sdk.bag_paths import is_bag
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.open_camera import is_recording
     from client_sdk.check.motion import MotionReference

@@ -31,11 +31,11 @@ from rse_pf.extensions.experiments.results.records import (
     sample_from_document,
     write_commands,
 )
-from rse_pf.extensions.experiments.results.result_folder import remove_keys
 from rse_pf.extensions.recording.platform_recorder import make_platform_recorder
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.monitor import MonitorSample
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.state import remove_keys
 from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]

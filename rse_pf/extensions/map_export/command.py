@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.command_line.map_store import VersionRequest
-from rse_pf.command_line.options import option
+from rse_pf.command_line.options import Action, option
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.map_export.colmap import encode_colmap
+from rse_pf.extensions.map_export.mcap_bag import export_bag
 from rse_pf.extensions.map_export.nerfstudio import encode_nerfstudio
 from rse_pf.extensions.map_export.occupancy import encode_occupancy
 from rse_pf.extensions.map_export.single_files import SINGLE_FILE_FORMATS, encode_single_file
@@ -25,7 +26,7 @@ from rse_pf.slam.occupancy import GridOptions, make_occupancy_grid
 from rse_pf.storage.files import read_regular_file, replace_file
 from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 
-__all__ = ["ExportRequest", "run_export"]
+__all__ = ["ACTION"]
 
 _FOLDER_NAMES = ("colmap", "nerfstudio", "occupancy")  # names of the formats that are a folder of files
 _BAG_FORMAT = "mcap"  # the name of the format of bags that ROS 2 and Foxglove read
@@ -88,15 +89,8 @@ class ExportRequest(VersionRequest):
     )
 
 
-def run_export(
-    request: ExportRequest, settings: PlatformSettings, write_bag: Callable[[Path, MapVersion], int]
-) -> None:
+def run_export(request: ExportRequest, settings: PlatformSettings) -> None:
     """Write a version of a map in the chosen format, and print the names and sizes of the files.
-
-    Args:
-        request: The version, the format and its options.
-        settings: Settings that name the store of maps, unless the request names one.
-        write_bag: Writes the map to a file as an MCAP bag and returns the size of the file in bytes.
 
     Raises:
         UsageError: An option belongs to another format, ``--out`` is a folder where the format is one file or
@@ -117,7 +111,7 @@ def run_export(
         raise UsageError(f"{request.out} is a folder", hint=f"{request.format} is one file: name it")
     version = maps.load(request.name, request.version)
     if request.format == _BAG_FORMAT:
-        size = write_bag(request.out, version)
+        size = export_bag(request.out, version)
     else:
         data = encode_single_file(version, request.format, request.robot)
         replace_file(request.out, data)
@@ -250,3 +244,10 @@ _FOLDER_FORMATS: dict[str, Callable[[ExportRequest, MapRegistry, MapVersion], _F
     "occupancy": _occupancy,
 }
 """The function that makes the files of each format that is a folder, by the name of the format."""
+
+ACTION = Action(
+    help="write a version in the format of another program",
+    example="rse-pf map export kitchen --format colmap --out kitchen-colmap",
+    request=ExportRequest,
+    run=run_export,
+)

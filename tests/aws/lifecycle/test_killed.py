@@ -62,7 +62,7 @@ def check_end(region: str, command: str) -> None:
     """Compare what stands with what the command promises."""
     account, stage = account_of(region, Killer()), COMMANDS[command][2]
     found = read_deployment(account, SETTINGS)
-    proof = prove(account, NAMES, gb_month_price=0.02, secret_month_price=0.4, now=datetime.now(timezone.utc))
+    proof = prove(account, NAMES, now=datetime.now(timezone.utc))
 
     assert found.stage == stage
     if stage == "up":
@@ -157,5 +157,5 @@ def test_locked_audit_logs_stay_and_are_reported_with_their_date(region: str) ->
 
     (line,) = [each for each in told if "object lock" in each]
     assert line.startswith("locked-auditlogs stays: object lock keeps 1 audit logs, the last until 20")
-    proof = prove(account, NAMES, gb_month_price=0.02, secret_month_price=0.4, now=datetime.now(timezone.utc))
+    proof = prove(account, NAMES, now=datetime.now(timezone.utc))
     assert [each.name for each in proof.kept] == ["locked-auditlogs"]

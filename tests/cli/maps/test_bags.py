@@ -18,10 +18,6 @@ from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, PATH, POINT_CLOUD,
 from client_sdk.point_map import write_ply
 from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.cli.main import main
-from rse_pf.geometry import Camera
-from rse_pf.maps.format import Keyframe, MapVersion, encode_map
-from rse_pf.maps.registry import MapRegistry
-from rse_pf.storage.object_store import DirectoryStore
 from tests.cli.maps.test_from_camera import PLATFORM, SolvingRobot
 from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 from tests.kit.small_bags import camera_info, raw_image, stamp_of, transforms
@@ -130,29 +126,3 @@ def test_results_become_a_bag_of_poses_path_and_cloud(folder: Path, kind: BagKin
         assert rows["rgb"].tolist() == [0xFF0102, 0x030405]
     assert main(["map", "to-bag", "out", "--out", file]) == 2  # it is there already
     assert not list(Path().glob(".bag-*"))
-
-
-def test_a_version_of_a_map_is_exported_as_mcap(folder: Path) -> None:
-    camera = Camera(fx=1, fy=1, cx=1, cy=1, width=2, height=2)
-    keyframes = [
-        Keyframe(
-            id=row, robot="a", timestamp_s=float(row), camera=camera, T_world_camera=np.eye(4),
-            pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
-            points_camera=np.zeros((0, 3), np.float32),
-        )
-        for row in (1, 2)
-    ]  # fmt: skip
-    version = MapVersion(
-        keyframes=tuple(keyframes), edges=(), points=np.zeros((4, 3), np.float32),
-        colours=np.zeros((4, 3), np.uint8),
-    )  # fmt: skip
-    MapRegistry(DirectoryStore(folder / "store")).commit(
-        "hall", encode_map(version), parent=None, author="t", created_s=1.0
-    )
-
-    for _ in range(2):  # the second one replaces the first
-        words = ["--format", "mcap", "--out", "h.mcap", "--store", "dir:store"]
-        assert main(["map", "export", "hall", *words]) == 0
-
-    with open_bag_file(Path("h.mcap")) as bag:
-        assert {topic.name for topic in bag.topics} == {"/a/pose", "/a/path", "/tf", "/map"}

@@ -19,16 +19,25 @@ from rse_pf.local.state import PlatformState, settings_file
 from rse_pf.maps.format import decode_map, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.storage.object_store import DirectoryStore
-from tests.cli.maps.test_bags import folder
 from tests.cli.maps.test_from_camera import PLATFORM
 from tests.cli.maps.test_from_camera import folder as video_folder
 from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-pytest.importorskip("rosbags", reason="pip install 'rse-pf[bags]'")
+from tests.kit.tum_recording import write_tum  # noqa: E402
 
-__all__ = ["folder", "video_folder"]
+__all__ = ["video_folder"]
 LENS = ("--camera", f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}")
+
+
+@pytest.fixture
+def folder(video_folder: Path) -> Path:
+    """The working folder, with a recording of six frames, a token, and a platform that answers."""
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = STEP_M * np.arange(6)
+    frames = (frame_at(row, depth=True) for row in range(6))
+    write_tum(video_folder / "drive", frames, Trajectory(np.arange(6) / 10, poses))
+    return video_folder
 
 
 def report_of(folder: str) -> dict[str, Any]:
@@ -41,12 +50,12 @@ def take_photo(row: int) -> str:
     return "photo.png"
 
 
-def test_the_map_of_a_bag_is_found_localised_in_merged_and_extended(
+def test_the_map_of_a_drive_is_found_localised_in_merged_and_extended(
     folder: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("gtsam", reason="pip install 'rse-pf[maps]'")
     for name in ("one", "two"):
-        assert main(["map", "from-bag", "drive.bag", "--out", name, *PLATFORM]) == 0
+        assert main(["map", "from-camera", "drive", "--out", name, *PLATFORM]) == 0
 
     report = report_of("one")
     assert report["store"] == f"dir:{state_home / 'rse-pf' / 'default' / 'objects'}"
@@ -61,8 +70,6 @@ def test_the_map_of_a_bag_is_found_localised_in_merged_and_extended(
     assert "joined" in capsys.readouterr().out
     assert main(["map", "live", "start", "hall", "--from", "both"]) == 0
     assert "hall has begun with" in capsys.readouterr().out
-    assert main(["map", "export", report["map"], "--store", report["store"], "--format", "ply",
-                 "--out", "one.ply"]) == 0  # fmt: skip
 
 
 def test_the_map_of_a_video_in_metres_can_be_localised_in(
@@ -82,31 +89,6 @@ def test_the_map_of_a_video_in_metres_can_be_localised_in(
     np.testing.assert_allclose(found["position_m"], [4 * 5 * STEP_M, 0.0, 0.0], atol=0.05)
 
 
-def test_images_of_keyframes_are_kept_if_asked_for_and_exported_with_the_map(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["map", "from-bag", "drive.bag", "--keep-images", *PLATFORM]) == 0
-    kept = sorted(Path("out-bag/images").iterdir())
-    assert report_of("out-bag")["images"] == len(kept) >= 2
-    capsys.readouterr()
-
-    words = ["--format", "nerfstudio", "--images", "out-bag/images", "--out", "nerf"]
-    assert main(["map", "export", "out-bag", *words]) == 0
-
-    frames = json.loads(Path("nerf/transforms.json").read_text())["frames"]
-    assert len(frames) == len(kept)
-    for frame in frames:
-        image = cv2.imread(str(Path("nerf") / frame["file_path"]))[:, :, ::-1]
-        row = round(frame["transform_matrix"][0][3] / STEP_M)
-        difference = np.abs(image.astype(int) - frame_at(row, depth=False).rgb).mean()
-        assert difference < 5
-    kept[0].unlink()
-    assert main(["map", "export", "out-bag", *words[:-1], "colmap"]) == 0
-    assert "out-bag/images has no image of 1 keyframe" in capsys.readouterr().out
-    assert main(["map", "from-bag", "drive.bag", "--out", "bare", *PLATFORM]) == 0
-    assert not Path("bare/images").exists()
-
-
 def test_a_map_up_to_scale_is_not_kept_and_the_report_says_why(
     video_folder: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,17 +104,17 @@ def test_a_map_up_to_scale_is_not_kept_and_the_report_says_why(
 
 def test_a_second_drive_is_the_next_version(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):
-        assert main(["map", "from-bag", "drive.bag", "--map", "hall", *PLATFORM]) == 0
+        assert main(["map", "from-camera", "drive", "--map", "hall", *PLATFORM]) == 0
 
     assert main(["map", "show", "hall", "--json"]) == 0
     shown = json.loads(last_json(capsys))
-    assert (shown["number"], shown["author"]) == (2, "rse-pf map from-bag")
+    assert (shown["number"], shown["author"]) == (2, "rse-pf map from-camera")
 
 
 def test_a_drive_is_kept_for_the_tenant_that_is_named(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["map", "from-bag", "drive.bag", "--map", "hall", "--tenant", "acme", *PLATFORM]
+    words = ["map", "from-camera", "drive", "--map", "hall", "--tenant", "acme", *PLATFORM]
     assert main(words) == 0
     assert "see rse-pf map show hall --tenant acme" in capsys.readouterr().out
 
@@ -196,7 +178,7 @@ def test_maps_of_a_named_platform_are_found_whether_it_runs_or_not(
 def test_a_wrong_name_of_a_map_is_refused_before_the_drive(
     folder: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["map", "from-bag", "drive.bag", "--map", name, *PLATFORM]) == 2
+    assert main(["map", "from-camera", "drive", "--map", name, *PLATFORM]) == 2
 
     error = capsys.readouterr().err
     assert "is not a valid name of a map" in error

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main
+from tests.kit.removed_extensions import skip_if_removed
 from tests.kit.wrong_inputs import WRONG_INPUTS, WrongInput, make_files
 
 TYPED_IN_A_SHELL = ("demos", "settings --settings misspelt.json", "map list --store dir:/typo")
@@ -53,6 +54,7 @@ def judge(wrong: WrongInput, code: int, out: str, err: str) -> None:
 def test_a_wrong_input_is_one_line_with_a_hint_that_fits(
     wrong: WrongInput, typed_there: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    skip_if_removed(wrong.typed)
     code = main(shlex.split(wrong.typed))
 
     told = capsys.readouterr()

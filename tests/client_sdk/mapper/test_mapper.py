@@ -21,8 +21,8 @@ from client_sdk.monocular.scale import OdometryScale
 from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory, read_trajectory
+from client_sdk.trajectory_error import accuracy
 from rse_pf.errors import Busy, UsageError
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.kit.fake_live_map import solve

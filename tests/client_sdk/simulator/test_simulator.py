@@ -16,8 +16,8 @@ from client_sdk.simulator.renderer import Renderer, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make_world
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import accuracy
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 

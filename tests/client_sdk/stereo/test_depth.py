@@ -17,12 +17,11 @@ from client_sdk.simulator import SIMULATED_CAMERA, make_world, render_pairs, tru
 from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from client_sdk.tracking.tracker import Tracker
-from rse_pf.config import PlatformSettings
-from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
+from client_sdk.trajectory_error import accuracy
 from rse_pf.geometry import Camera, inverse, transform
 from rse_pf.maps.format import decode_map
 from rse_pf.pnp import DepthNoise
+from tests.kit.fake_live_map import solve
 from tests.kit.flat_world import tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -39,7 +38,7 @@ def pairs() -> Sequence[Frame]:
 
 def drive(frames: Sequence[Frame], **options: object) -> Mapper:
     """Return a mapper that has tracked the frames."""
-    mapper = Mapper(ask=InProcessSolver(PlatformSettings()).ask, **options)  # type: ignore[arg-type]
+    mapper = Mapper(ask=solve, **options)  # type: ignore[arg-type]
     tracked(mapper, frames)
     return mapper
 

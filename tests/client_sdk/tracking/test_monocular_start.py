@@ -17,7 +17,7 @@ from client_sdk.simulator.renderer import Renderer, add_image_noise
 from client_sdk.simulator.world import make_world
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
+from client_sdk.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3
 from tests.kit.fake_live_map import solve
 from tests.kit.flat_world import frame_at, tracked

@@ -15,8 +15,8 @@ from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
 from client_sdk.tracking.landmark_matching import NO_LANDMARK, make_place_vector
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import accuracy
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import Features

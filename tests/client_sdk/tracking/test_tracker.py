@@ -14,8 +14,8 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import accuracy
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference
 from tests.kit.flat_world import DEPTHS_M, STEP_M, covered, foreign, frame_at
 from tests.kit.tracked_drives import NO_ANSWER, Answer, run, run_all, solve

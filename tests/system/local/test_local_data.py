@@ -19,8 +19,8 @@ import client_sdk
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, RsePfError
-from rse_pf.extensions.experiments.faults import faults
 from rse_pf.identity import RobotId, object_name
+from rse_pf.local import faults
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.control.status import data_url, platform_status, status_table

@@ -13,7 +13,7 @@ import pytest
 from server.live_map.test_served import keyframe
 
 from rse_pf.cli.main import main
-from rse_pf.extensions.experiments.faults.faults import signal_tree
+from rse_pf.local.faults import signal_tree
 from rse_pf.local.processes import mark_of
 from rse_pf.wire import Command, Result
 

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 from client_sdk.trajectory import write_trajectory
-from rse_pf.extensions.experiments.results.trajectory_error import Accuracy
+from client_sdk.trajectory_error import Accuracy
 
 __all__ = ["evo_ate_cm", "evo_command"]
 

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from client_sdk.trajectory_error import MAX_TRUTH_GAP_S, SAME_STAMP_S, STEP_S
 from rse_pf.extensions.experiments.compare.configurations import Configuration
 from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.tracking_run import TrackingRun
-from rse_pf.extensions.experiments.results.trajectory_error import MAX_TRUTH_GAP_S, SAME_STAMP_S, STEP_S
 
 __all__ = ["drive_heading", "make_report", "row_of", "runs_line", "table_lines", "tolerance_line"]
 

@@ -117,8 +117,8 @@ async def platform_solver(settings: PlatformSettings, folder: Path) -> AsyncIter
     *folder* is the state folder of the platform, from which the keys are deleted.
     """
     from client_sdk import connect
-    from rse_pf.extensions.experiments.results.result_folder import remove_keys
     from rse_pf.local.control.platform import LocalPlatform
+    from rse_pf.local.state import remove_keys
 
     try:
         async with LocalPlatform(settings, port=0, state=folder, name="compare") as platform:

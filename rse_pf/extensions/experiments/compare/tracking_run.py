@@ -14,11 +14,11 @@ import numpy as np
 
 from client_sdk.mapper import Mapper
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import Accuracy, accuracy
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.extensions.experiments.compare.configurations import Configuration, failure_line
 from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.solvers import MeteredSolver
-from rse_pf.extensions.experiments.results.trajectory_error import Accuracy, accuracy
 from rse_pf.geometry import Array
 
 __all__ = ["TrackingRun", "longest_gap_s", "score", "track"]

@@ -22,10 +22,10 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, RsePfError
 from rse_pf.extensions.experiments.demo.live import LIVE_NAME
 from rse_pf.extensions.experiments.faults.failing_store import failing_environment, set_failing_percent
-from rse_pf.extensions.experiments.faults.faults import signal_tree
 from rse_pf.extensions.experiments.faults.network_emulator import PROFILES, LinkProcess
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.faults import signal_tree
 from rse_pf.server.live_map.lease import LeaseRecord, decode_lease, lease_name
 from rse_pf.storage.object_store import DirectoryStore
 

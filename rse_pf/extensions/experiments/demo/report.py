@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.check.drive_check import DriveCheck
+from client_sdk.trajectory_error import trajectory_figures
+from rse_pf.command_line.drive_output import lost_line
 from rse_pf.extensions.experiments.demo.robot import RobotFinished
 from rse_pf.extensions.experiments.results.live_error import live_lines, live_table
 from rse_pf.extensions.experiments.results.map_error import merged_lines, merged_table
-from rse_pf.extensions.experiments.results.markdown import failures, lost_line, page, slashed, table, three
+from rse_pf.extensions.experiments.results.markdown import failures, page, slashed, table, three
 from rse_pf.extensions.experiments.results.records import CommandRecord
 from rse_pf.extensions.experiments.results.summary import PAPER, summarise
-from rse_pf.extensions.experiments.results.trajectory_error import trajectory_figures
 from rse_pf.terminal import counted
 
 __all__ = ["advice", "closing_lines", "demo_page", "is_lost", "make_report"]
@@ -118,8 +118,8 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
         second += (
             f"up to scale, with neither depth, a second camera nor an IMU: {_robots(report['up_to_scale'])}\n"
         )
-    shown = _relative(folder)
-    files = f"{shown}/map.png, " if (folder / "map.png").exists() else ""
+    out = _relative(folder)
+    files = f"{out}/map.png, " if (folder / "map.png").exists() else ""
     third = ""
     if _without_pose(report) > _MOST * report["frames"]:
         third = f"failed: {_without_pose(report)} of {counted(report['frames'], 'frame')} have no pose\n"
@@ -129,16 +129,19 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
         third += f"robot {number} has no pose: {reason}\n" if reason else ""
     if "merged" in report:
         third += merged_lines(report["merged"])
-        files = f"{shown}/map_merged.png, {shown}/merged.ply, "
-        third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
-    for name, result in report.get("checks", {}).items():
-        third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(result, shown))
+        files = f"{out}/map_merged.png, {out}/merged.ply, "
+        third += f"show the merged map: rse-pf map show merged --store dir:{out}/platform/objects\n"
+    if "checks" in report:
+        from client_sdk.check.drive_check import DriveCheck
+
+        for name, result in report["checks"].items():
+            third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(result, shown))
     if "live" in report:
         third += live_lines(report["live"], report["robots"])
     return (
         f"{first}\n{second}{third}{advice(report)}"
-        f"results: {files}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}; "
-        f"{shown}/report.md, report.json, commands.csv, events.jsonl, samples.csv"
+        f"results: {files}{out}/robot-*/{{map.ply,map.png,trajectory.txt}}; "
+        f"{out}/report.md, report.json, commands.csv, events.jsonl, samples.csv"
     )
 
 

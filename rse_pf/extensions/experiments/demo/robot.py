@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from client_sdk.check.drive_check import DriveCheck
-from client_sdk.check.motion import MotionReference
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
@@ -31,6 +29,7 @@ from client_sdk.robot import Robot
 from client_sdk.source_facts import DoubtLog, unresolved
 from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
+from rse_pf.command_line.extras import is_installed
 from rse_pf.config import SessionSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError, error_of_system
 from rse_pf.extensions.experiments.child_process import ChildFailed, ChildReady, ParentPipe
@@ -39,6 +38,7 @@ from rse_pf.extensions.experiments.demo.merge import MAP_FILE
 from rse_pf.extensions.experiments.results.records import TRUTH, CommandRecord
 
 if TYPE_CHECKING:
+    from client_sdk.check.drive_check import DriveCheck
     from client_sdk.datasets import CameraChoice, Dataset
 
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
@@ -252,9 +252,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             pipe.send(ChildReady(len(frames)))
             began = planned = await asyncio.to_thread(pipe.wait_start)
             recorder = LiveRecorder(shared, time.monotonic, began).start() if options.live else None
-            check = DriveCheck(
-                is_wanted=options.check and options.data is not None, is_thinned=loaded.is_thinned
-            )
+            check = _make_check(options, loaded)
             first_s = time.monotonic()
             waiting = iter(frames)
             following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
@@ -270,7 +268,8 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 if recorder is not None:
                     recorder.frame(done)
                 drive.tracked.append(done)
-                await asyncio.to_thread(check.add, frame, done)
+                if check is not None:
+                    await asyncio.to_thread(check.add, frame, done)
                 pipe.send(FrameDone(row + 1))
             took_s = time.monotonic() - first_s
         if recorder is not None:
@@ -302,16 +301,29 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         )
 
 
+def _make_check(options: DemoOptions, loaded: _Loaded) -> DriveCheck | None:
+    """Return a check of the drive over a recording; None if none is wanted, or the extension was removed."""
+    if not (options.check and options.data is not None and is_installed("client_sdk.check")):
+        return None
+    from client_sdk.check.drive_check import DriveCheck
+
+    return DriveCheck(is_thinned=loaded.is_thinned)
+
+
 def _checked(
-    check: DriveCheck, mapper: Mapper | LiveMapper, loaded: _Loaded, accepted: Sequence[str]
+    check: DriveCheck | None, mapper: Mapper | LiveMapper, loaded: _Loaded, accepted: Sequence[str]
 ) -> dict[str, Any] | None:
-    """Return the result of *check*; None if no check is wanted.
+    """Return the result of *check*; None without a check.
 
     The keyframes of *mapper* may be changed, so this is called after the files of the robot were written.
     """
-    offsets = mapper.adjust_pairs() if check.is_wanted and isinstance(mapper, Mapper) else {}
+    if check is None:
+        return None
+    from client_sdk.check.motion import MotionReference
+
     reference = MotionReference.of_truth(loaded.truth, loaded.truth_kind, is_camera=False)
-    return check.finish(reference, offsets, unresolved(loaded.log.doubts, accepted), accepted)
+    tracked = mapper if isinstance(mapper, Mapper) else None
+    return check.finish(tracked, reference, unresolved(loaded.log.doubts, accepted), accepted)
 
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:

@@ -1,4 +1,4 @@
-"""Fault injection: kill, pause, slow down or cut off a server, let a store fail, and emulate a network link.
+"""Faults of experiments: a store whose writes fail, and an emulated network link.
 
-Only experiments and the commands of ``rse-pf local`` that inject faults use this package.
+Faults of the servers of a platform are injected by `rse_pf.local.faults`.
 """

@@ -30,11 +30,10 @@ from rse_pf.extensions.experiments.results.records import (
     SampleLog,
     write_commands,
 )
-from rse_pf.extensions.experiments.results.result_folder import remove_keys
 from rse_pf.local.firewall import key_file, read_key
 from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive
 from rse_pf.local.servers.backend_servers import RSE_PF
-from rse_pf.local.state import PlatformState, read_state, state_folder, stop_platform
+from rse_pf.local.state import PlatformState, read_state, remove_keys, state_folder, stop_platform
 
 __all__ = ["run_control_plane_fault"]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from client_sdk.point_map import read_ply
 from client_sdk.trajectory import read_trajectory
+from client_sdk.trajectory_error import trajectory_figures
 from rse_pf.config import PlatformSettings
 from rse_pf.extensions.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.extensions.experiments.results.bars import Bars
@@ -25,7 +26,6 @@ from rse_pf.extensions.experiments.results.records import (
 from rse_pf.extensions.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.extensions.experiments.results.result_folder import finish_report, load_average
 from rse_pf.extensions.experiments.results.summary import PAPER, summarise
-from rse_pf.extensions.experiments.results.trajectory_error import trajectory_figures
 from rse_pf.terminal import show_page
 
 __all__ = ["CLOUD", "asked_of", "map_figures", "map_page", "run_map"]

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from client_sdk.trajectory import Trajectory, read_trajectory
+from client_sdk.trajectory_error import align, matched_poses, residuals_m, rms
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.extensions.experiments.results.map_error import move_frames
 from rse_pf.extensions.experiments.results.markdown import number, table
 from rse_pf.extensions.experiments.results.records import TRUTH
-from rse_pf.extensions.experiments.results.trajectory_error import align, matched_poses, residuals_m, rms
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, decode_map
 

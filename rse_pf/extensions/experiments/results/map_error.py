@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from client_sdk.trajectory import Trajectory
+from client_sdk.trajectory_error import matched_poses, residuals_m, rms
 from rse_pf.extensions.experiments.results.markdown import table
-from rse_pf.extensions.experiments.results.trajectory_error import matched_poses, residuals_m, rms
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-__all__ = ["about_run", "failures", "lost_line", "number", "page", "slashed", "table", "three"]
+__all__ = ["about_run", "failures", "number", "page", "slashed", "table", "three"]
 
 
 def page(*blocks: str | Sequence[str]) -> str:
@@ -62,9 +62,3 @@ def about_run(report: Mapping[str, Any]) -> str:
         f"Python {about['python']}; {versions}; settings digest "
         f"{about['settings_digest']}.{generators}"
     )
-
-
-def lost_line(report: Mapping[str, Any]) -> str:
-    """Return the text with the number of lost frames, and of those before a monocular robot's first pose."""
-    before = report["frames_before_start"]
-    return f"{report['lost_frames']} lost" + (f", {before} before the start" if before else "")

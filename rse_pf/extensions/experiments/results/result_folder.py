@@ -27,7 +27,6 @@ __all__ = [
     "finish_report",
     "fresh_folder",
     "load_average",
-    "remove_keys",
     "write_json",
 ]
 
@@ -144,10 +143,3 @@ def load_average() -> list[float]:
 def write_json(path: Path, report: Mapping[str, Any]) -> None:
     """Write *report* as indented JSON."""
     path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-def remove_keys(platform_folder: Path) -> None:
-    """Delete the signing keys of a stopped platform and of its live maps, so that results hold no secret."""
-    for pattern in ("key*.json", "objects/live/key=*"):
-        for file in platform_folder.glob(pattern):
-            file.unlink()

@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
 from rse_pf.config import PlatformSettings
-from rse_pf.extensions.experiments.faults import faults
+from rse_pf.local import faults
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.control.status import platform_status, status_table

@@ -56,7 +56,7 @@ def test_no_lens_model_but_radial_tangential_takes_the_distortion_of_a_pinhole()
 
 
 def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    check = DriveCheck(is_wanted=True)
+    check = DriveCheck()
     check.add(None, None)  # type: ignore[arg-type]  # a frame that it cannot read
     told = check.finish()
 

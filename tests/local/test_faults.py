@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.faults.faults import (
+from rse_pf.local.faults import (
     cut_off,
     find_server,
     nft_commands,

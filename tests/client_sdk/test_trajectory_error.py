@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from client_sdk.trajectory import Trajectory, read_trajectory
-from rse_pf.errors import UsageError
-from rse_pf.extensions.experiments.results.trajectory_error import (
+from client_sdk.trajectory_error import (
     accuracy,
     align,
     match_truth,
     trajectory_figures,
     with_truth,
 )
+from rse_pf.errors import UsageError
 from rse_pf.geometry import exp_se3, inverse
 
 RECORDED = Path(__file__).parents[4] / "shared" / "data" / "tum_trajectories"
