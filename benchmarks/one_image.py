@@ -20,15 +20,15 @@ from rse_pf.images import load_opencv
 
 Image = npt.NDArray[np.uint8]
 
-RATE_HZ = 10.0  # frames per second
+RATE_HZ = 10.0  # frames per second of the generated drives
 NOISE = 2.0  # standard deviation of the noise of each pixel, the same in all colours, in grey levels of 255
-GAIN = 0.03  # standard deviation of a frame's brightness, as a share of the scene's
+GAIN = 0.03  # standard deviation of the brightness of a frame, as a share of the brightness of the scene
 OFFSET = 2.0  # standard deviation of the level that is added to all pixels of a frame, in grey levels
 SHAKE_DEG = 0.1  # standard deviation of the rotation of a camera at rest about each axis, in each frame
 PATCH_SPEED_PX = (2.0, 6.0)  # slowest and fastest motion of a patch from frame to frame, along each axis
 ROTATION_FRAMES = 120  # number of frames of a camera that rotates
-ROTATION_DEG = (5.0, 15.0, 3.0)  # amplitudes about x (pitch), y (yaw) and z (roll)
-ROTATION_PERIOD_S = 6.0  # of the yaw, which turns by at most 1.6 deg from frame to frame
+ROTATION_DEG = (5.0, 15.0, 3.0)  # amplitudes of the rotation about x (pitch), y (yaw) and z (roll)
+ROTATION_PERIOD_S = 6.0  # period of the yaw, which turns by at most 1.6 deg from frame to frame
 PLANE_M = 2.0  # depth of a plane in the middle of the scene's image
 
 
@@ -71,7 +71,7 @@ def photograph(
 ) -> Frame:
     """Return the frame of a camera before the plane that shows the image of a scene, with light and noise.
 
-    Beyond its edges the image goes on as if mirrored.
+    Beyond its edges the image is continued as its mirror image.
 
     Args:
         scene: The image, as the camera sees it from the pose of identity.
@@ -139,7 +139,8 @@ def resting_frames(scene: Scene, count: int, seed: int, patch: Image | None = No
 def rotating_frames(scene: Scene, seed: int, focal_factor: float = 1.0, k1: float = 0.0) -> Iterator[Frame]:
     """Yield the frames of a camera that rotates about its centre.
 
-    They state *focal_factor* times the true focal lengths, and do not state the distortion *k1*.
+    The cameras of the frames state *focal_factor* times the true focal lengths, and no distortion instead of
+    *k1*.
     """
     rng, camera = np.random.default_rng([seed, 3]), scene.camera
     stated = Camera(

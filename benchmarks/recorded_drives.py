@@ -44,7 +44,7 @@ def red_kitchen(recordings: Path) -> Dataset:
 
 
 def drive(dataset: Dataset, rows: Sequence[int], robot: str, options: FrontEndOptions | None = None) -> Run:
-    """Track *rows* of *dataset* by visual odometry from the origin; return what the robot would have."""
+    """Track *rows* of *dataset* by visual odometry from the origin; return the robot's map and poses."""
     options = options or FrontEndOptions()
     tracker = Tracker(options)
     keyframes: list[Keyframe] = []
@@ -114,9 +114,9 @@ async def answer(query: PoseQuery) -> PoseAnswer:
 
 
 def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
-    """Return ``T_camera_world`` of a query, its inliers, and whether it is weak, as the platform does.
+    """Solve a pose query as the platform does: return ``T_camera_world``, inlier count, whether it is weak.
 
-    Without a pose they are None, 0 and False.
+    Without a pose the result is None, 0 and False.
     """
     try:
         solution = solved(query)
@@ -135,7 +135,7 @@ def track(tracker: Tracker | MonocularTracker, frame: Frame) -> TrackedFrame:
 
 
 def cloud_of(dataset: Dataset, rows: Sequence[int], T_world_camera: Array, voxel_m: float = 0.01) -> PointMap:
-    """Return the cloud of *rows* seen from *T_world_camera*."""
+    """Return the point cloud of the frames *rows* at the poses *T_world_camera*, with voxels of *voxel_m*."""
     cloud = PointMap(MapOptions(voxel_m=voxel_m))
     for row, T in zip(rows, T_world_camera, strict=True):
         cloud.add(dataset.read(row), T)

@@ -20,17 +20,19 @@ from tests.kit.inertial_drive import InertialDrive, Motion
 
 __all__ = ["CheckedDrive", "recorded_drive", "rendered_drive"]
 
-# Rates of frames and of odometry; way of a drive on wheels between two frames, metres.
-RATE_HZ, _ODOMETRY_HZ, _STEP_M = 10.0, 20.0, 0.034
-_SCALE, _NOISE_M, _NOISE_RAD = 0.003, 0.0005, 0.0004
-"""Standard deviations of an odometry's errors: of its scale (relative), and of each of its steps (metres,
-radians)."""
-_BASELINE_M = 0.11  # distance of the two cameras of a stereo pair
+RATE_HZ = 10.0  # frames per second of a rendered drive
+_ODOMETRY_HZ = 20.0  # poses per second of the odometry of a rendered drive
+_STEP_M = 0.034  # distance, metres, that a camera on wheels moves between two frames
+# Relative standard deviation of the metric scale of an odometry, one value per drive.
+_SCALE_DEVIATION = 0.003
+_STEP_NOISE_M = 0.0005  # standard deviation, metres per axis, of the translation of each step of an odometry
+_STEP_NOISE_RAD = 0.0004  # standard deviation, radians per axis, of the rotation of each step of an odometry
+_BASELINE_M = 0.11  # distance, metres, between the two cameras of a stereo pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CheckedDrive:
-    """Frames without a fault, the true poses at their stamps, and an odometry of its own rate."""
+    """A drive without a fault: frames, the true poses at their time stamps, and odometry at its own rate."""
 
     name: str
     frames: Sequence[Frame]
@@ -39,9 +41,9 @@ class CheckedDrive:
 
 
 def rendered_drive(seed: int, frames: int = 150, *, stereo: bool = False) -> CheckedDrive:
-    """Return a drive through the rooms of *seed*: on wheels if it is even, in a hand if it is odd.
+    """Return a rendered drive through the rooms of *seed*: on wheels if it is even, hand-held if it is odd.
 
-    Frames have depth images, or those of a second camera if it is *stereo*.
+    Frames have depth images, or if *stereo* the images of a second camera.
     """
     every = round(_ODOMETRY_HZ / RATE_HZ)
     make = partial(_wheels if seed % 2 == 0 else _hand, seed)
@@ -67,21 +69,21 @@ def recorded_drive(folder: Path, first: int = 0, frames: int | None = None) -> C
 
 
 def odometry_of(truth: Trajectory, seed: int) -> Trajectory:
-    """Return a path as an odometry measures it: each step with noise, and the scale a little wrong."""
+    """Return the path *truth* as odometry measures it: each step with noise, all steps with a wrong scale."""
     rng = np.random.default_rng([seed, 42])
-    scale = 1.0 + _SCALE * float(rng.standard_normal())
+    scale = 1.0 + _SCALE_DEVIATION * float(rng.standard_normal())
     poses = [np.eye(4)]
     true = truth.T_world_camera
     for before, after in itertools.pairwise(true):
         step = inverse(before) @ after
         step[:3, 3] *= scale
-        noise = rng.standard_normal(6) * np.repeat((_NOISE_M, _NOISE_RAD), 3)
+        noise = rng.standard_normal(6) * np.repeat((_STEP_NOISE_M, _STEP_NOISE_RAD), 3)
         poses.append(poses[-1] @ step @ exp_se3(noise))
     return Trajectory(truth.timestamps_s, np.array(poses))
 
 
 def _wheels(seed: int, poses: int) -> Trajectory:
-    """Return the path of a camera on wheels, *poses* poses of the loop through the rooms, as of `_hand`."""
+    """Return the path of a camera on wheels along the loop through the rooms, *poses* at `_ODOMETRY_HZ`."""
     rng = np.random.default_rng([seed, 43])
     path = loop_trajectory(
         float(rng.uniform(0.0, 28.0)), poses, seed, step_m=_STEP_M * RATE_HZ / _ODOMETRY_HZ
@@ -90,7 +92,7 @@ def _wheels(seed: int, poses: int) -> Trajectory:
 
 
 def _hand(seed: int, poses: int) -> Trajectory:
-    """Return the path of a hand-held camera that stays near one point of the middle room of `make_world`.
+    """Return the path of a hand-held camera that stays near the centre of the middle room of `make_world`.
 
     Translation and rotation are sums of slow sines (`InertialDrive`): about 0.5 m at most from the mean
     position, which is in the middle of the room, and about 0.5 rad from the first orientation.  *poses* is

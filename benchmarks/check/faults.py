@@ -23,7 +23,7 @@ __all__ = ["FAULTS", "Fault"]
 
 _DARK_BRIGHTNESS = 12.0  # brightness that replaces 255 in a dark image
 _STRETCH = 10
-"""Number of frames in a row that are of one of two cameras; half the period of light and dark frames."""
+"""Number of successive frames from one of two cameras; also half the period of light and dark frames."""
 
 Plant = Callable[[Iterable[Frame]], Iterator[Frame]]
 """Plants a fault: returns the frames of a drive with the fault."""
@@ -111,9 +111,9 @@ def _zoomed(frame: Frame, zoom: float) -> Frame:
 
 
 def _two_cameras(zoom: float, stretch: int | None) -> Plant:
-    """Plant frames of a second camera, of *zoom* times the focal length, under the calibration of the first.
+    """Replace frames by those of a camera of *zoom* times the focal length that has the same calibration.
 
-    They are every second *stretch* of frames, or the second half of the drive if *stretch* is None.
+    Every second run of *stretch* frames is replaced, or the second half of the drive if *stretch* is None.
     """
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -143,9 +143,9 @@ def _depth(scale: float, offset_m: float) -> Plant:
 
 
 def _late_depth(delay_s: float) -> Plant:
-    """Plant a delay of depth: each frame gets the depth of the frame nearest to *delay_s* before it.
+    """Plant a delay of depth: each frame gets the depth image of the frame that is about *delay_s* older.
 
-    The first frames, which have no such frame, are left out.
+    The first frames, which have no such older frame, are left out.
     """
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -166,7 +166,7 @@ def _stamped(delay_s: float) -> Plant:
 
 
 def _some(change: Callable[[Frame, npt.NDArray[np.uint8] | None], Frame], every: int) -> Plant:
-    """Change each *every*-th frame; *change* gets the frame, and the image before it (None for the first)."""
+    """Change each *every*-th frame by *change*, a function of the frame and the image before it or None."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         before: npt.NDArray[np.uint8] | None = None
@@ -193,7 +193,7 @@ def _repeated(every: int) -> Plant:
 
 
 def _dark(share: float) -> Plant:
-    """Give the first *share* of every 2 * `_STRETCH` frames a twentieth of the light."""
+    """Darken the first *share* of every 2 * `_STRETCH` frames to a twentieth of the light."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         for row, frame in enumerate(frames):
@@ -206,12 +206,12 @@ def _dark(share: float) -> Plant:
 
 
 def _missing(*rows: int) -> Plant:
-    """Leave out these *rows* (0 to 9) of each ten frames."""
+    """Leave out the frames with the indices *rows* (0 to 9) of each ten frames."""
     return lambda frames: (frame for row, frame in enumerate(frames) if row % 10 not in rows)
 
 
 def _jittered(share: float) -> Plant:
-    """Move each time stamp by up to *share* of the median interval, either way."""
+    """Change each time stamp by up to *share* of the median interval between frames, in both directions."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
         every, rng = list(frames), np.random.default_rng(6)
@@ -244,7 +244,7 @@ def _baseline(share: float) -> Plant:
 
 
 def _shifted(offset_px: float) -> Plant:
-    """Shift right images by *offset_px* to the right, so that disparities are smaller by as much."""
+    """Shift right images by *offset_px* to the right, so that disparities are smaller by *offset_px*."""
     moved = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, 0.0]])
 
     def change(frame: Frame) -> Frame:
@@ -259,7 +259,7 @@ def _shifted(offset_px: float) -> Plant:
 
 
 def _swapped(frame: Frame) -> Frame:
-    """Return a frame whose left image is the right one of its pair, and the other way round."""
+    """Return a frame in which the left and the right image are exchanged."""
     assert frame.stereo is not None
     left = np.repeat(frame.stereo.gray[:, :, None], 3, axis=2)
     right = np.ascontiguousarray(frame.rgb[:, :, 1])
@@ -267,7 +267,7 @@ def _swapped(frame: Frame) -> Frame:
 
 
 def _listed() -> Iterator[Fault]:
-    """Yield all faults: one series after the other, its severities numbered from 1."""
+    """Yield all faults, series by series; the severities of a series are numbered from 1."""
 
     def three(
         kind: FaultKind, name: str, faults: list[tuple[float | None, Plant]], needs: str = ""

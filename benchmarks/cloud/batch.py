@@ -1,12 +1,13 @@
 """Measure a merge in parts: copies of the red kitchen on two worker processes, with and without kills.
 
 Each copy of the map is moved as a whole, its poses drift, and its pixels, depths, descriptors and cloud have
-noise.  The copies are merged in one process, on workers, and on workers of which one is killed, and then the
-scheduler.
+noise.  The copies are merged three times: in one process, on worker processes, and on worker processes of
+which one is killed, and then the scheduler as well.
 
-Defends: with and without kills, loop closures and aligned clouds are equal to the bit to those of one process
-and poses within 0.1 mm; measuring loop closures and aligning clouds is at least 1.6 times as fast on two idle
-cores.
+Defends the promise that long jobs survive a crash of their server and that large merges run on several
+processes.  The bars: with and without kills, loop closures and aligned clouds are equal to the bit to those
+of one process, and poses differ by at most 0.1 mm; measuring loop closures and aligning clouds is at least
+1.6 times as fast on two idle cores.
 
     python -m benchmarks cloud.batch --recordings ../shared/data --copies 20 --candidates 2 --out batch.json
     python -m benchmarks cloud.batch --recordings ../shared/data --copies 4 --frames 60
@@ -44,9 +45,13 @@ from tests.kit.in_process_engine import InProcessEngine
 
 __all__ = ["kitchen", "noisy_copy"]
 
-_STEP_M, _STEP_DEG = 0.002, 0.05
-"""Drift of a copy from one keyframe to the next."""
-_PIXEL, _DEPTH_M, _CLOUD_M, _FLIPPED_BITS = 0.3, 0.004, 0.003, 0.02
+_DRIFT_M = 0.002  # standard deviation, metres per axis, of the drift of a copy between successive keyframes
+_DRIFT_DEG = 0.05  # standard deviation, degrees per axis, of the drift of a copy between successive keyframes
+_PIXEL_NOISE_PX = 0.3  # standard deviation of the pixels of features of a copy
+_DEPTH_NOISE_M = 0.004  # standard deviation of the depths of features of a copy
+_CLOUD_NOISE_M = 0.003  # standard deviation, per axis, of the points of the cloud of a copy
+_FLIPPED_BITS = 0.02  # share of the bits of the descriptors of a copy that are flipped
+# Steps of a merge that run on worker processes.
 _PARALLEL = ("vectors", "pairs", "links", "agree", "tiles")
 
 
@@ -63,7 +68,7 @@ class Options:
 
 
 def kitchen(recordings: Path, frames: int) -> MapVersion:
-    """Return the red kitchen with every frame a keyframe, at tracked poses, and its cloud."""
+    """Return a map of the red kitchen: every frame is a keyframe at its tracked pose; with a cloud."""
     from benchmarks.recorded_drives import cloud_of, drive, keyframe_of, red_kitchen
 
     dataset = red_kitchen(recordings)
@@ -79,10 +84,10 @@ def kitchen(recordings: Path, frames: int) -> MapVersion:
 
 
 def noisy_copy(version: MapVersion, number: int) -> MapVersion:
-    """Return *version* as another robot would have mapped it: moved, drifted, with noise; seeded."""
+    """Return *version* as another robot would have mapped it, with drift and noise; *number* is the seed."""
     rng = np.random.default_rng(number)
     start = np.eye(4) if number == 0 else exp_se3(rng.normal(size=6) * np.array([2, 2, 0.2, 0.1, 0.1, 1.0]))
-    spread = np.array([_STEP_M] * 3 + [np.radians(_STEP_DEG)] * 3)
+    spread = np.array([_DRIFT_M] * 3 + [np.radians(_DRIFT_DEG)] * 3)
     old = [keyframe.T_world_camera for keyframe in version.keyframes]
     poses, edges = [start @ old[0]], []
     for row in range(1, len(old)):
@@ -93,7 +98,7 @@ def noisy_copy(version: MapVersion, number: int) -> MapVersion:
         _noisy(keyframe, T, number, rng) for keyframe, T in zip(version.keyframes, poses, strict=True)
     )
     points = deform_cloud(version.points, version.keyframes, np.array(poses))
-    points += rng.normal(size=points.shape) * _CLOUD_M
+    points += rng.normal(size=points.shape) * _CLOUD_NOISE_M
     return MapVersion(
         keyframes=keyframes, edges=tuple(edges), points=points.astype(np.float32), colours=version.colours
     )  # fmt: skip
@@ -106,7 +111,7 @@ def noisy_copy(version: MapVersion, number: int) -> MapVersion:
     Bar("speed_up_links_and_icp", at_least=1.6, unit="times"),
 )
 def run_benchmark(args: Options) -> dict[str, Any]:
-    """Merge in one process, on workers, and with kills."""
+    """Merge in one process, on worker processes, and on worker processes that are killed."""
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
         return _measure(args, Path(folder))
 
@@ -164,7 +169,10 @@ def merge_in_one_process(folder_name: str, candidates: str) -> None:
 def _in_workers(
     args: Options, folder: Path, names: list[str], called: str, *, kills: bool
 ) -> tuple[BatchMergeResult, dict[str, Any]]:
-    """Merge on worker processes; kill a worker at a third of the links, and the scheduler at two thirds."""
+    """Merge on worker processes; if *kills*, kill a worker after a third and the scheduler after two thirds.
+
+    The shares are of the step that measures loop closures.
+    """
     store, source = DirectoryStore(folder / called), DirectoryStore(folder / "one")
     for name in names:
         store.put(name, source.get(name))
@@ -226,7 +234,7 @@ def _merge(folder: Path, name: str) -> MapVersion:
 
 
 def _apart_m(one: MapVersion, other: MapVersion) -> float:
-    """Return the largest distance of a keyframe's two positions."""
+    """Return the largest distance, metres, between the positions of one keyframe in both maps."""
 
     def places(version: MapVersion) -> Array:
         return np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
@@ -237,11 +245,11 @@ def _apart_m(one: MapVersion, other: MapVersion) -> float:
 def _noisy(keyframe: Keyframe, T_world_camera: Array, number: int, rng: np.random.Generator) -> Keyframe:
     count = len(keyframe.pixels)
     points = keyframe.points_camera.astype(np.float64)
-    points *= 1.0 + (rng.normal(size=(count, 1)) * _DEPTH_M) / np.maximum(points[:, 2:], 0.3)
+    points *= 1.0 + (rng.normal(size=(count, 1)) * _DEPTH_NOISE_M) / np.maximum(points[:, 2:], 0.3)
     flips = np.packbits(rng.random((count, 256)) < _FLIPPED_BITS, axis=1)
     return Keyframe(
         id=keyframe.id, robot=f"copy-{number}", timestamp_s=keyframe.timestamp_s,
         T_world_camera=T_world_camera, camera=keyframe.camera,
-        pixels=(keyframe.pixels + rng.normal(size=(count, 2)) * _PIXEL).astype(np.float32),
+        pixels=(keyframe.pixels + rng.normal(size=(count, 2)) * _PIXEL_NOISE_PX).astype(np.float32),
         descriptors=keyframe.descriptors ^ flips, points_camera=points.astype(np.float32),
     )  # fmt: skip

@@ -6,7 +6,8 @@ A data service, forked from this process, sends itself SIGKILL at one of the sys
 store: before the call, after it, or in the middle of a write.  The next service starts in the same folder.
 All objects of the store are read after every tenth kill and after the last two.
 
-Defends: every acknowledged object is in the store and whole, and no partial object is visible.
+Defends the promise that an acknowledged object is in the store and whole after kill -9, and that no partial
+object is visible.
 """
 
 from __future__ import annotations
@@ -47,7 +48,10 @@ TIMEOUT_S = 30.0  # longest wait for an answer of the service, and for its start
 
 
 def die_at(number: int, place: int) -> None:
-    """Kill this process at call *number* of its data threads: before it (0), after (1) or within it (2)."""
+    """Kill this process at system call *number* of its data threads.
+
+    *place* is 0 for before the call, 1 for after the call, and 2 for within the call.
+    """
     calls = [0]
 
     def patched(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
@@ -78,7 +82,7 @@ def die_at(number: int, place: int) -> None:
 
 
 def serve(folder: Path, number: int, place: int) -> None:
-    """Serve in this process, which was forked, until it kills itself."""
+    """Serve in this forked process until the process kills itself."""
     log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(log, 2)
     die_at(number, place)
@@ -139,7 +143,7 @@ def run_benchmark(*, kills: int = 500, seed: int = 1) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(dir=ROOT / "build") as made:
         folder = Path(made)
         (folder / "keys.json").write_text(KEY.key_set().to_json())
-        openapi_page()  # once, not in each service
+        openapi_page()  # made once here, and not in each forked service
         for kill in range(kills):
             announcement = folder / "announce.json"
             announcement.unlink(missing_ok=True)
@@ -147,12 +151,12 @@ def run_benchmark(*, kills: int = 500, seed: int = 1) -> dict[str, Any]:
             if not child:
                 try:
                     serve(folder, source.randrange(1, LAST_CALL), kill % 3)
-                finally:  # never back to the caller, which would remove the folder
+                finally:  # the forked process does not return to the caller, which would remove the folder
                     traceback.print_exc()
                     os._exit(1)
             source.random()
             until = time.monotonic() + TIMEOUT_S
-            while not announcement.exists() and time.monotonic() < until:  # a child that ended has a message
+            while not announcement.exists() and time.monotonic() < until:
                 time.sleep(0.002)  # polls, with a deadline
             port = json.loads(announcement.read_text())["port"]
             with contextlib.suppress(OSError, http.client.HTTPException):

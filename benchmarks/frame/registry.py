@@ -1,12 +1,13 @@
 """Benchmarks as functions: how one is registered, found, and run with its arguments.
 
-A benchmark is one function of a module below ``benchmarks``, decorated with `benchmark` and its bars.  Its
-name is that of the module (``benchmarks/server/peer.py`` is ``server.peer``), its help the docstring of
-the module.  It returns its figures; measuring the load, judging, printing and writing is done here.
+A benchmark is one function of a module below ``benchmarks``, decorated with `benchmark` and its bars, which
+are the limits of its figures.  The name of the benchmark is that of the module (``benchmarks/server/peer.py``
+is ``server.peer``), its help is the docstring of the module.  The function returns its figures; this module
+measures the load of the machine, compares figures with bars, and prints and writes the report.
 
-The parameters of the function are its arguments, or the fields of a dataclass if that is its only parameter.
-A parameter without a default is positional; ``Annotated[int, "text"]`` gives the text of its help, and
-``Annotated[str, "text", CHOICES]`` the values that it can have.
+The parameters of the function are the arguments of the command line, or the fields of a dataclass if that is
+the only parameter.  A parameter without a default is positional.  ``Annotated[int, "text"]`` gives the help
+of an argument, and ``Annotated[str, "text", CHOICES]`` the values that are allowed.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from benchmarks.frame.report import Bar, judge, show, write
+from benchmarks.frame.report import Bar, check_bars, show, write
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.extensions.experiments.results.result_folder import environment, load_average
@@ -58,7 +59,7 @@ def benchmark(*bars: Bar) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def names() -> Iterator[tuple[str, str]]:
-    """Yield name and first line of the help of every benchmark; nothing of them is imported."""
+    """Yield the name and the first line of the help of every benchmark, without importing the benchmarks."""
     for path in sorted(ROOT.glob("*/*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         calls = (
@@ -69,7 +70,7 @@ def names() -> Iterator[tuple[str, str]]:
 
 
 def find(name: str) -> Benchmark:
-    """Import the benchmark *name*; raises UsageError if there is none."""
+    """Import the benchmark *name*; raises UsageError for an unknown name."""
     if name not in dict(names()):
         raise UsageError(f"there is no benchmark {name!r}", hint="python -m benchmarks lists them")
     module = f"benchmarks.{name}"
@@ -78,7 +79,7 @@ def find(name: str) -> Benchmark:
 
 
 def command_of(function: Callable[..., Any], *arguments: str) -> list[str]:
-    """Return the command that calls a *function* of a module with *arguments* in a process of its own."""
+    """Return the command line that calls *function* of a module with *arguments* in a new process."""
     module, name = function.__module__, function.__name__
     return [
         sys.executable,
@@ -89,7 +90,7 @@ def command_of(function: Callable[..., Any], *arguments: str) -> list[str]:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command line; return 0, 1 for a missed bar, or 2 for what cannot be measured."""
+    """Run the command line; return 0, or 1 for a missed bar, or 2 if the benchmark cannot be run."""
     top = argparse.ArgumentParser(
         prog="python -m benchmarks", description="Run a benchmark, or list all of them.",
         epilog="python -m benchmarks NAME --help explains one.",
@@ -125,7 +126,7 @@ def _run_one(name: str, arguments: Sequence[str]) -> int:
         "benchmark": name, "options": given if holder is found.measure else asdict(holder(**given)),
         **environment(PlatformSettings()), "load_average": before, "load_average_after": load_average(),
         "took_s": round(time.monotonic() - began_s, 1), "figures": figures,
-        "bars": judge([bar for bar in found.bars if bar.is_exact or not is_short], figures),
+        "bars": check_bars([bar for bar in found.bars if bar.is_exact or not is_short], figures),
     }  # fmt: skip
     show(report)
     if out is not None:
@@ -161,13 +162,13 @@ def parser_of(name: str, found: Benchmark) -> argparse.ArgumentParser:
         _add(parser, key, hints[key], parameter.default)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the report as JSON")
     parser.add_argument(
-        "--short", action="store_true", help="judge only the bars that neither time nor load can miss"
+        "--short", action="store_true", help="check only the bars that neither time nor load can miss"
     )
     return parser
 
 
 def _holder(measure: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what has the arguments as parameters: the dataclass that *measure* takes, or *measure*."""
+    """Return the dataclass whose fields are the arguments of *measure*, or *measure* itself without one."""
     hints = get_type_hints(measure)
     hints.pop("return", None)
     only = next(iter(hints.values())) if len(hints) == 1 else None
@@ -181,7 +182,7 @@ def _hints(measure: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _add(parser: argparse.ArgumentParser, key: str, hint: Any, default: Any) -> None:
-    """Add the argument *key*: its type decides how it is read."""
+    """Add the argument *key* to the parser; the type in *hint* decides how its text is parsed."""
     text, options = "", dict[str, Any]()
     if get_origin(hint) is Annotated:
         hint, text, *choices = get_args(hint)

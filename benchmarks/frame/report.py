@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Bar", "judge", "say", "show", "write"]
+__all__ = ["Bar", "check_bars", "say", "show", "write"]
 
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """What a figure must hold: a number at most or at least, or one value.
+    """A limit that a figure of a benchmark must keep: a largest number, a smallest number, or one value.
 
-    *figure* is its path in the figures, with dots between keys; ``*`` stands for every key or row, of which
-    the worst one is judged.  A figure that is not there was not measured, which misses nothing; None and NaN
-    miss the bar.
+    *figure* is the path of the figure in the report, with dots between keys.  ``*`` stands for every key or
+    row, of which the worst value counts.  A figure that is missing was not measured, and does not miss the
+    bar; a figure of None or NaN does.
     """
 
     figure: str
@@ -44,11 +44,11 @@ class Bar:
 
     @property
     def is_exact(self) -> bool:
-        """Whether it is one value, which a short run on a busy machine has, too."""
+        """Whether the bar is one value, which does not depend on the duration of a run or the load."""
         return self.at_most is None and self.at_least is None
 
     def holds(self, value: Any) -> bool:
-        """Return whether *value* holds the bar."""
+        """Return whether *value* keeps the limit of the bar."""
         if self.is_exact:
             return bool(value == self.equals)
         if value is None or math.isnan(value):
@@ -56,9 +56,9 @@ class Bar:
         return bool(value <= self.at_most if self.at_most is not None else value >= self.at_least)
 
 
-def judge(bars: Sequence[Bar], figures: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return, for each bar, its figure (the worst one) and whether it is met; None if it was not measured."""
-    judged = []
+def check_bars(bars: Sequence[Bar], figures: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return for each bar the worst value of its figure, and whether the bar is met (None: not measured)."""
+    checked = []
     for bar in bars:
         values = [value for value in _values(figures, bar.figure.split(".")) if value is not _MISSING]
         worst = next((value for value in values if not bar.holds(value)), values[0] if values else None)
@@ -66,11 +66,11 @@ def judge(bars: Sequence[Bar], figures: Mapping[str, Any]) -> list[dict[str, Any
         if values and len(numbers) == len(values) and bar.equals is None:
             worst = max(numbers) if bar.at_most is not None else min(numbers)
         met = bar.holds(worst) if values else None
-        judged.append({"figure": bar.figure, "limit": bar.limit, "value": worst, "met": met})
-    return judged
+        checked.append({"figure": bar.figure, "limit": bar.limit, "value": worst, "met": met})
+    return checked
 
 
-_MISSING = object()
+_MISSING = object()  # stands for a figure that a report does not have
 
 
 def _values(found: Any, keys: Sequence[str]) -> Iterator[Any]:
@@ -87,12 +87,12 @@ def _values(found: Any, keys: Sequence[str]) -> Iterator[Any]:
 
 
 def say(text: object) -> None:
-    """Show progress, beside the report."""
+    """Print a line of progress to standard error, so that standard output has the report alone."""
     print(text, file=sys.stderr, flush=True)
 
 
 def show(report: Mapping[str, Any]) -> None:
-    """Print the report as JSON, and a line for each bar beside it."""
+    """Print the report as JSON to standard output, and a line for each bar to standard error."""
     print(_text(report))
     for bar in report["bars"]:
         verdict = {True: "met", False: "MISSED", None: "not measured"}[bar["met"]]
@@ -101,7 +101,7 @@ def show(report: Mapping[str, Any]) -> None:
 
 
 def write(file: Path, report: Mapping[str, Any]) -> None:
-    """Write the report as JSON."""
+    """Write the report to *file* as JSON."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(_text(report) + "\n", encoding="utf-8")
 
@@ -111,7 +111,7 @@ def _text(report: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return *value* as JSON knows it: NaN as null, keys as text, arrays as lists."""
+    """Return *value* with the types of JSON: NaN becomes None, keys become text, arrays become lists."""
     if isinstance(value, Mapping):
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple | set | np.ndarray):

@@ -14,14 +14,14 @@ __all__ = ["median_ratio", "percentile", "spread"]
 
 
 def percentile(values: Any, percent: Any, axis: int | None = None) -> Any:
-    """Return the percentile of *values*, linear between two of them; NaN without any."""
+    """Return a percentile of *values*, linearly interpolated between two of them; NaN without values."""
     if not len(values):
         return np.full(np.shape(percent), np.nan)[()]
     return np.percentile(values, percent, axis=axis)
 
 
 def spread(values: Iterable[float]) -> dict[str, float | int | None]:
-    """Return n, mean, p50, p95, p99 and max, to three digits; None without any value."""
+    """Return number, mean, p50, p95, p99 and maximum of values, with three decimals; None without values."""
     return percentiles([float(value) for value in values])
 
 

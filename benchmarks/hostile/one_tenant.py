@@ -4,19 +4,21 @@
 
 One local platform with two servers and a quota of 64 MiB for a tenant.  The measured robot asks for a pose
 (200 matches) ten times a second, sends a keyframe 2.5 times a second and stores 64 KiB once a second.  A pair
-is two windows of the same length: beside a neighbour that uses its full quota as it should (19 commands and
-20 requests a second, a live map of its own), and beside one that attacks; which one comes first alternates.
-Each neighbour is a process of its own, at the lowest priority: in the field it has its own machine.
+is two windows of the same length.  In one window a fair neighbour, a robot of another tenant, uses its full
+quota (19 commands and 20 requests a second, a live map of its own); in the other window a neighbour attacks.
+The order of the two windows alternates.  Each neighbour is a process of its own at the lowest priority, since
+in the field it would run on another machine.
 
 Attacks: ``leave`` (keyframe, live-leave, again and again), ``maps`` (a keyframe and a subscription to each of
 eight maps), ``keyframes`` (of one map, as fast as they are answered), ``descriptors`` (keyframes of 20 kinds
 that no robot makes), ``topics`` (rosbridge: latched and throttled messages of 250 kB), ``objects`` (of eight
 bytes), ``versions`` (of one map), ``jobs`` (long ones).
 
-Defends: for each attack the median over the pairs of the ratio of p99 is at most 1.3 for poses, keyframes and
-objects; none of them is refused; what the attacker's tenant stores grows to its quota and 64 MiB at most; the
-servers and their owners of maps take at most 64 MiB more than beside the other neighbour, and the memory of
-the owners that an attack with several maps may have (2 of a server).
+Defends the promise that no robot, whatever it sends, raises the p99 of another tenant by more than 1.5 times.
+The bars are stricter.  For each attack the median over the pairs of the ratio of p99 (attack over fair
+neighbour) is at most 1.3 for poses, keyframes and objects, of which none is refused.  The attacker's tenant
+stores at most its quota and 64 MiB.  Servers and map servers take at most 64 MiB more memory than with the
+fair neighbour; an attack with several maps may also have two map servers on each server.
 """
 
 from __future__ import annotations
@@ -63,14 +65,21 @@ from rse_pf.wire.live_map import live_topic
 
 __all__ = ["ATTACKS", "measure"]
 
-HOME, RIVAL = "home", "rival"
-QUOTA_BYTES = 64 << 20
-RATIO, GROWTH_MIB, OWNERS_MIB = 1.3, 64.0, 4 * 120.0
-POSE_HZ, KEYFRAME_HZ, PUT_HZ = 10.0, 2.5, 1.0
-FAIR_COMMANDS_HZ, FAIR_PUT_HZ = 19.0, 20.0
-_WARM_S, _REST_S = 5.0, 1.0
-_DEADLINE_S = 5.0
-_LOWEST_PRIORITY = 19
+HOME = "home"  # tenant of the measured robot
+RIVAL = "rival"  # tenant of the attacking robot
+QUOTA_BYTES = 64 << 20  # storage quota of each tenant
+MAX_P99_RATIO = 1.3  # largest ratio of the p99 during an attack to the p99 with a fair neighbour
+MAX_GROWTH_MIB = 64.0  # most memory, and most storage beyond the quota, that an attack may take
+MAP_SERVERS_MIB = 4 * 120.0  # memory of the map servers of an attack with several maps, two on each server
+POSE_HZ = 10.0  # poses per second for which the measured robot asks
+KEYFRAME_HZ = 2.5  # keyframes per second that the measured robot sends
+PUT_HZ = 1.0  # objects per second that the measured robot stores
+FAIR_COMMANDS_HZ = 19.0  # commands per second of a fair neighbour: nearly its full rate limit
+FAIR_PUT_HZ = 20.0  # objects per second that a fair neighbour stores
+_WARM_S = 5.0  # time for which the measured robot runs before the first window
+_REST_S = 1.0  # pause between two windows
+_DEADLINE_S = 5.0  # longest wait for an answer, and for the exit of a neighbour
+_LOWEST_PRIORITY = 19  # nice value of a neighbour's process
 _CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
 _GRAPH = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n" + (
     "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
@@ -78,7 +87,7 @@ _GRAPH = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n" + 
 
 
 def keyframe(name: str, number: int, features: int = 600) -> dict[str, Any]:
-    """Return the request with keyframe *number* of a robot that drives straight on; all features differ."""
+    """Return the request with keyframe *number* of a robot that drives straight past random features."""
     rng = np.random.default_rng(number)
     made = SentKeyframe(
         timestamp_s=number / KEYFRAME_HZ, T_odom_camera=exp_se3([0.1 * number, 0, 0, 0, 0, 0]),
@@ -92,7 +101,7 @@ def keyframe(name: str, number: int, features: int = 600) -> dict[str, Any]:
 
 
 class DataClient:
-    """One connection to the data service.  Blocking."""
+    """A blocking client with one connection to the data service."""
 
     def __init__(self, url: str, token: str) -> None:
         self._at = url.split("/")[2]
@@ -101,7 +110,7 @@ class DataClient:
         self._lock = threading.Lock()
 
     def ask(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
-        """Return status and content; 0 if the connection failed."""
+        """Send a request; return the HTTP status (0: the connection failed) and the content of the answer."""
         with self._lock:
             try:
                 self._connection.request(method, path, body, self._headers)
@@ -117,12 +126,12 @@ class DataClient:
             self._connection.close()
 
     def put(self, data: bytes) -> int:
-        """Store an object; return the status."""
+        """Store *data* as an object; return the HTTP status."""
         return self.ask("PUT", f"/data/v1/objects/{digest_of(data)}", data)[0]
 
 
 class Measured:
-    """The robot of the other tenant: when it asked, what for, how long it took (ms), and how it ended."""
+    """The measured robot; ``rows`` has time (s), kind, duration (ms) and result code of each request."""
 
     def __init__(self, robot: Robot, data: DataClient) -> None:
         self.rows: list[tuple[float, str, float, str]] = []
@@ -132,7 +141,7 @@ class Measured:
         self._number = 0
 
     async def drive(self) -> None:
-        """Work until cancelled."""
+        """Ask for poses, send keyframes and store objects until cancelled."""
         await asyncio.gather(
             self._each(POSE_HZ, "pose", self._ask_pose),
             self._each(KEYFRAME_HZ, "keyframe", self._send_keyframe),
@@ -176,7 +185,7 @@ Neighbour = Callable[[Robot, "_Place"], Awaitable[None]]
 
 
 class _Place:
-    """Where a neighbour is, and how often each of its requests ended how."""
+    """The platform and the token of a neighbour, and the number of its requests by result code."""
 
     def __init__(self, url: str, token: str) -> None:
         self.url, self.token = url, token
@@ -239,7 +248,7 @@ async def _maps(robot: Robot, place: _Place) -> None:
 async def _keyframes(robot: Robot, place: _Place) -> None:
     number = 0
     while True:
-        most = 8 if number else 1  # the first one begins the map
+        most = 8 if number else 1  # the first keyframe creates the map
         requests = [keyframe(place.tag, number + socket_number, 894) for socket_number in range(most)]
         codes = await asyncio.gather(*(place.call(robot, "live-keyframe", request) for request in requests))
         number += codes.count("ok")
@@ -331,7 +340,7 @@ ATTACKS: dict[str, Neighbour] = {
 
 
 def run_neighbour(name: str, url: str, token: str, seconds: float, pipe: Connection) -> None:
-    """Be a neighbour for *seconds* after each order of *pipe*; entry point of a process."""
+    """Run the neighbour *name* for *seconds* after each order in *pipe*; entry point of a process."""
     os.nice(_LOWEST_PRIORITY)
     work = {FAIR: _fair, **ATTACKS}[name]
     while pipe.recv() == "go":
@@ -343,7 +352,7 @@ async def _run_bounded(work: Neighbour, url: str, token: str, seconds: float) ->
     until = time.monotonic() + seconds
     async with contextlib.AsyncExitStack() as stack:
         robot = connect(url, token=token, codec="bin")
-        if work is not _topics:  # a second connection would end the first
+        if work is not _topics:  # a second connection of the robot would close the first
             await stack.enter_async_context(robot)
         task = asyncio.ensure_future(work(robot, place))
         await asyncio.wait({task}, timeout=until - time.monotonic())
@@ -358,7 +367,7 @@ async def _run_bounded(work: Neighbour, url: str, token: str, seconds: float) ->
 
 
 async def measure(names: Sequence[str], pairs: int, seconds: float, folder: Path) -> list[dict[str, Any]]:
-    """Return a row for each attack: ratios of p99, what was refused, and what grew."""
+    """Return a row for each attack: ratios of p99, refused requests, and growth of memory and storage."""
     settings = PlatformSettings().replace(
         data={"tenant_quota_bytes": QUOTA_BYTES}, serving={"rosbridge": True}
     )
@@ -445,7 +454,7 @@ async def _pairs(
 
 
 def _store_of(state: Path) -> Path:
-    """Return the folder of the platform's objects."""
+    """Return the folder below *state* in which the platform stores objects."""
     return next(path.parent for path in state.rglob("accounts") if path.is_dir())
 
 
@@ -460,20 +469,20 @@ def _tail_ms(measured: Measured, spans: Sequence[tuple[float, float]], what: str
 
 @benchmark(
     *(
-        Bar(f"*.ratios.{what}", at_most=RATIO, unit="times the p99")
+        Bar(f"*.ratios.{what}", at_most=MAX_P99_RATIO, unit="times the p99")
         for what in ("pose", "keyframe", "object")
     ),
     Bar("*.refused", equals={}),
-    Bar("*.stored_mib", at_most=QUOTA_BYTES / 2**20 + GROWTH_MIB, unit="MiB"),
-    Bar("*.memory_without_owners_mib", at_most=GROWTH_MIB, unit="MiB"),
+    Bar("*.stored_mib", at_most=QUOTA_BYTES / 2**20 + MAX_GROWTH_MIB, unit="MiB"),
+    Bar("*.memory_without_owners_mib", at_most=MAX_GROWTH_MIB, unit="MiB"),
 )
 def run_benchmark(
     *, pairs: int = 10, seconds: float = 60.0, only: Annotated[tuple[str, ...], "attacks", ATTACKS] = ()
 ) -> dict[str, Any]:
-    """Attack in every way."""
+    """Measure the effect of each attack."""
     with tempfile.TemporaryDirectory() as folder:
         rows = asyncio.run(measure(list(only or ATTACKS), pairs, seconds, Path(folder)))
     for row in rows:
-        owners_mib = OWNERS_MIB if row["attack"] == "maps" else 0.0
+        owners_mib = MAP_SERVERS_MIB if row["attack"] == "maps" else 0.0
         row["memory_without_owners_mib"] = row["memory_mib"] - owners_mib
     return {row["attack"]: row for row in rows}

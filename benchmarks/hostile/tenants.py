@@ -1,4 +1,4 @@
-"""Three tenants whose robots have one name: nothing of one may reach another, in interleaved commands.
+"""Interleave commands of three tenants whose robots have one name: no data may reach another tenant.
 
     python -m benchmarks hostile.tenants [--commands 10000]
 
@@ -7,7 +7,8 @@ sequence numbers), keeps and reads a secret in a stateful service, names its own
 objects, and asks for the same long job.  Then the server's log is read: every line of a command must name its
 tenant.
 
-Defends (issue 14): nothing shared in 10,000 interleaved commands, no ``stale`` caused by another tenant.
+Defends the promise that tenants do not see each other: in 10,000 interleaved commands no data of another
+tenant appears, and no command is refused as ``stale`` because of another tenant's robot of the same name.
 """
 
 from __future__ import annotations

@@ -1,7 +1,11 @@
-"""The live map in one process, without a platform: accuracy, joins, wrong links, replay and growth.
+"""Measure the live map in one process, without a platform: accuracy, joins, wrong loop closures, replay,
+growth.
 
 Recordings are tracked by the product's `Tracker`; poses are solved in this process, and corrections reach a
 robot two frames late.  Ground truth is used for errors only.
+
+Defends the promises that the final live map of three robots in the red kitchen has an error of at most 3.1 cm
+and that the replay of its log gives the same map.
 
     python -m benchmarks live.one_process kitchen --recordings ../shared/data --runs 10
     python -m benchmarks live.one_process foreign --recordings ../shared/data --runs 20
@@ -51,22 +55,25 @@ from tests.kit.generated_drives import (
     straight,
 )
 
+# Options with a keyframe every 0.1 m or 6 degrees, as in maps of the red kitchen.
 DENSE = FrontEndOptions(is_spread=False, keyframe_m=0.1, keyframe_deg=6.0)
-LATE_FRAMES = 2
+LATE_FRAMES = 2  # frames by which a correction reaches its robot after the keyframe that caused it
 PARTS = ("kitchen", "foreign", "wrong", "twins", "replay", "growth")
+# Frames of the red kitchen that each of three robots drives.
 KITCHEN_CUTS = {"a": range(84), "b": range(84, 168), "c": range(168, 250)}
+# Recordings of unrelated places, whose robots must not be joined.
 FOREIGN = ("redwood_living_room", "nyu_dining_room", "tum_fr1_xyz_start", "7scenes_redkitchen")
 
 
 @dataclass(slots=True, eq=False)
 class Played:
-    """A live map at the end of its drives, and what its robots were sent.
+    """A live map at the end of its drives, and the poses that its robots received.
 
     Attributes:
         live_map: The map.
         ids: The ids of the keyframes of each robot, in the order of sending.
-        given: ``T_map_camera`` as each robot knew it while it drove, by frame; without the frames before it
-            was joined.
+        given: ``T_map_camera`` by robot and frame, as the robot knew it at this frame; frames before the
+            robot was joined to the map are missing.
         outcomes: All outcomes of the events, in order.
     """
 
@@ -90,7 +97,7 @@ class Played:
         return 100.0 * ate_m(np.concatenate(poses), np.concatenate([truth[name] for name in runs]))
 
     def joined_at(self) -> dict[str, int]:
-        """Return the first frame of each robot, in its own count, of which it knew the pose in the map."""
+        """Return for each robot its first frame of which the robot knew the pose in the map."""
         return {name: min(frames) for name, frames in self.given.items() if frames}
 
 
@@ -104,9 +111,9 @@ def final_poses(run: Run, T_world_keyframe: Array) -> Array:
 
 
 def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:
-    """Return positions ``(n, 2)``, m, `STEP_M` apart, on *rows* parallel lines of *length_m* in turn.
+    """Return positions ``(n, 2)``, metres, `STEP_M` apart, along *rows* parallel lines of *length_m* in turn.
 
-    The lines are *apart_m* from each other, so that the way never comes back to a place.
+    The lines are *apart_m* metres from each other, so that the path never comes back to a place.
     """
     corners: list[tuple[float, float]] = []
     for row in range(rows):
@@ -119,7 +126,7 @@ def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) ->
 
 
 def play(runs: Mapping[str, Run], starts: Mapping[str, int]) -> Played:
-    """Let robots drive at the same time, each from its own start (frames), into one live map."""
+    """Run drives of robots into one live map at the same time; *starts* delays each robot by some frames."""
     played = Played(live_map=LiveMap())
     known: dict[str, Array | None] = dict.fromkeys(runs)
     under_way: list[tuple[int, str, Array | None]] = []
@@ -185,7 +192,7 @@ def _random_links(runs: int, inliers: int) -> tuple[int, int]:
 
 
 def _plant(seed: int) -> int:
-    """Return after how many keyframes with true links four planted ones, which agree, are removed."""
+    """Plant four consistent wrong loop closures; return how many keyframes with true ones remove them."""
     world = GeneratedWorld(seed=seed, links=0)
     live_map = LiveMap()
     way = circle(1.0, 1.0)
@@ -298,7 +305,7 @@ def foreign(recordings: Path, runs: int) -> dict[str, Any]:
 
 
 def wrong_links(runs: int) -> dict[str, Any]:
-    """Return how many random wrong loop closures are accepted, and how long four planted ones stay."""
+    """Return how many random wrong loop closures are accepted, and how long four consistent ones stay."""
     waited = spread(_plant(seed) for seed in range(runs))
     accepted = {
         f"{inliers} inliers": dict(zip(("accepted", "sent"), _random_links(runs, inliers), strict=True))
@@ -310,27 +317,27 @@ def wrong_links(runs: int) -> dict[str, Any]:
 def twins(runs: int) -> dict[str, Any]:
     """Return how often robots in two rooms that look the same are joined wrongly.
 
-    The rooms are 10 m apart.  The map is told a size of 4 m of rooms that look the same, or 0: every place
-    is unique (`MapStarted.equal_rooms_m`).
+    The rooms are 10 m apart.  `MapStarted.equal_rooms_m` states to the map that rooms of 4 m look the same,
+    or (0) that every place is unique.
     """
     return {
-        f"{told_m:g} m stated": {
-            "one robot in each room": _twins(runs, told_m, drives_across=False),
-            "one drives across": _twins(runs, told_m, drives_across=True),
-            "unique rooms": _one_building(runs, told_m),
+        f"{stated_size_m:g} m stated": {
+            "one robot in each room": _twins(runs, stated_size_m, drives_across=False),
+            "one drives across": _twins(runs, stated_size_m, drives_across=True),
+            "unique rooms": _one_building(runs, stated_size_m),
         }
-        for told_m in (0.0, 4.0)
+        for stated_size_m in (0.0, 4.0)
     }
 
 
-def _one_building(runs: int, told_m: float) -> dict[str, Any]:
+def _one_building(runs: int, stated_size_m: float) -> dict[str, Any]:
     """Return after how many metres two robots that drive the same 9 m through unique rooms are joined."""
     at_m = []
     for seed in range(runs):
         world = GeneratedWorld(seed=seed, links=2)
         drives = [world.drive(name, straight(0.0, 9.0)) for name in ("a", "b")]
         live_map = LiveMap()
-        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
+        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=stated_size_m))
         for event in world.play(drives):
             for outcome in live_map.apply(event):
                 if isinstance(outcome, Joined) and outcome.robot == "b":
@@ -338,7 +345,7 @@ def _one_building(runs: int, told_m: float) -> dict[str, Any]:
     return {"n": runs, "joined": len(at_m), "joined_after_m": spread(at_m)}
 
 
-def _twins(runs: int, told_m: float, *, drives_across: bool) -> dict[str, int]:
+def _twins(runs: int, stated_size_m: float, *, drives_across: bool) -> dict[str, int]:
     wrong = ambiguous = ever = 0
     for seed in range(runs):
         world = GeneratedWorld(seed=seed, twin_m=10.0, links=2)
@@ -346,7 +353,7 @@ def _twins(runs: int, told_m: float, *, drives_across: bool) -> dict[str, int]:
         if drives_across:
             drives.insert(1, world.drive("c", straight(0.0, 13.0)))
         live_map = LiveMap()
-        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
+        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=stated_size_m))
         outcomes = [outcome for event in world.play(drives) for outcome in live_map.apply(event)]
         ever += any(isinstance(outcome, Joined) and outcome.robot == "b" for outcome in outcomes)
         aligned = {alignment.robot: alignment.aligned for alignment in live_map.alignments()}
@@ -381,11 +388,12 @@ def replay() -> dict[str, Any]:
 def growth(keyframes: int) -> dict[str, Any]:
     """Return the CPU time of a keyframe in two maps that grow to *keyframes* keyframes, one drive each.
 
-    The drive of ``wide`` never comes back to a place; that of ``revisiting`` goes round a circle of 3 m
+    The drive of ``wide`` never comes back to a place; the drive of ``revisiting`` goes round a circle of 3 m
     radius again and again.  The time is that of adding a keyframe and its loop closures, without
-    optimisations.  ``late_ms`` is that of the last tenth of the keyframes, milliseconds; ``times_a_tenth`` is
-    the ratio of its percentiles to those when the map had a tenth of its keyframes.  ``kept`` is the number
-    of keyframes in the map at the end; ``peak_gib`` is the peak memory of this process until then.
+    optimisations.  ``late_ms`` is the time for the last tenth of the keyframes, milliseconds;
+    ``times_a_tenth`` is the ratio of its percentiles to those when the map had a tenth of its keyframes.
+    ``kept`` is the number of keyframes in the map at the end; ``peak_gib`` is the peak memory of this process
+    until then.
     """
     rows = {}
     for what, way in (

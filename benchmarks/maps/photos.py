@@ -1,4 +1,4 @@
-"""Localise photos in maps that other frames made: how many are right, and whether their sigmas are.
+"""Localise photos in maps made of other frames: how many poses are right, and whether their sigmas are.
 
     python -m benchmarks maps.photos ../shared/data [--n 600]
 
@@ -8,7 +8,8 @@ poses of map and photos are those by structure from motion, since the given pose
 those of the other by 5 cm.  ``mh01`` maps every ninth stereo pair of the first half of MH_01 and localises
 every fifth left image of the other half; ``rpy forward`` and ``rpy back`` do the same with fr1/rpy and depth.
 ``twin`` maps a rendered building at every third frame of a drive, and a building that looks the same, 20 m
-away, at every frame; photos are taken in the first one, 10 cm beside, 10 cm higher and turned by 5 degrees.
+away, at every frame.  Photos are taken in the first building: 10 cm aside and 10 cm above the path of the
+mapped drive, and turned by 5 degrees.
 
 A photo is right if it is ``ok`` within 5 cm and 2 deg of the truth; the share is of all photos.  The sigma is
 ``position_sigma_m``; a photo that is ``ok``, off by more than three sigmas and by more than 5 cm is *misled*.
@@ -16,8 +17,9 @@ A photo that is placed in the twin would be misled by 20 m.  Foreign photos show
 each map in turn: NYU, KITTI, EuRoC, TUM, and rendered rooms of other seeds with the same furniture.  CPU time
 is that of decoding, features and pose.  Everything but the CPU time is deterministic: n = 1.
 
-Defends: >= 78 % right in the kitchen and MH_01, 76 and 18 % in fr1/rpy; none misled, no foreign photo ok;
-45 to 85 % of the errors inside one sigma, >= 90 % inside two; p50 <= 60 ms of CPU time a photo.
+Defends the promise of localisation in a map.  The bars: >= 78 % of the photos right in the kitchen and MH_01,
+76 and 18 % in fr1/rpy forward and back; no photo misled, and no foreign photo ok; 45 to 85 % of the errors
+below one sigma, >= 90 % below two; median CPU time of a photo <= 60 ms.
 """
 
 from __future__ import annotations
@@ -57,7 +59,8 @@ FR1_RPY = "tum_fr1_rpy_start"
 TWIN_FRAMES = 90  # frames of the drive through a rendered building, 6.8 cm apart
 TWIN_SHIFT_M = 20.0  # distance of the twin from the building of the photos
 ASIDE = exp_se3(np.array([0.1, -0.1, 0.0, 0.0, np.radians(5.0), 0.0]))
-"""``T_camera_photo``: how the photos of a rendered world are taken beside the drive of its map."""
+"""``T_camera_photo``: pose of the photos of a rendered world relative to the camera of the mapped drive,
+metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,7 +71,7 @@ class Photo:
         jpeg: The file.
         camera: Intrinsics, without distortion.
         T_map_camera: The true pose in the map; None for a photo of another place.
-        recording: Name of the recording that it is from; empty for a rendered one.
+        recording: Name of the recording of the photo; empty for a rendered photo.
     """
 
     jpeg: bytes
@@ -250,7 +253,7 @@ def _verdict_of(found: PhotoLocation) -> str:
 def _localise_all(
     index: MapIndex, photos: Sequence[Photo]
 ) -> tuple[dict[str, Any], list[tuple[float, float]], list[float]]:
-    """Localise *photos*; return the figures, error and sigma of each that is ok, m, and the CPU times, ms."""
+    """Localise *photos*; return figures, errors and sigmas (m) of the ``ok`` ones, and CPU times (ms)."""
     verdicts, took_ms, errors = Counter[str](), [], []
     right = 0
     for photo in photos:

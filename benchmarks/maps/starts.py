@@ -1,15 +1,15 @@
-"""Track one lens without depth from its first frame: where it must start, and where it must not.
+"""Start the tracker of one lens without depth: from its first frames on moving cameras, and never at rest.
 
     python -m benchmarks maps.starts ../shared/data [--only drives rest] [--seconds 60] [--seed 0]
 
 ``drives``: KITTI 06 and 00 forwards, backwards and at half rate, and rendered corridors.  Bars: >= 98 % of
 the frames posed, the first pose within 8 frames, ATE (Sim(3)) <= 1.5 % of the path.
-``rest``: one image of each of five scenes is repeated at 10 Hz with shake, changes of light and noise, as it
-is and with a textured patch of 10 to 30 % of the image that moves before it.  A pose is a false start.  Bars:
-0, and at most 1 of 5 with a patch.
+``rest``: one image of each of five scenes is repeated at 10 Hz with shake, changes of light and noise, with
+and without a textured patch of 10 to 30 % of the image that moves before it.  A pose is a false start.  Bars:
+0 false starts without a patch, and at most 1 of 5 with a patch.
 ``rotation``: one image of each of six scenes as a camera sees it that rotates about its centre, with the
 right intrinsics and with wrong ones (focal length 5 or 7 % off, or a distortion that is not stated).  A pose
-is a false start.  Bars: 0 and 0.
+is a false start.  Bar: 0 false starts.
 ``planes``: a camera moves past a plane 2 m away: sideways, sideways with an oblique plane, and towards it.
 The relative pose of the two views of the start is right if the translation is within 30 deg of the true one
 and the rotation within 5 deg.  Bar: 9 of 9.
@@ -17,6 +17,8 @@ and the rotation within 5 deg.  Bar: 9 of 9.
 Frames between the two views of a start count as posed; the first posed frame is the first whose pose was
 returned at once, counted from 1.  Poses are solved in this process as the service does.  Everything is
 deterministic: n = 1, and load changes no figure.  The seed chooses images, patches, motions and corridors.
+
+Defends the promise that one lens without depth is tracked, and that degenerate input never gives a pose.
 """
 
 from __future__ import annotations
@@ -61,10 +63,10 @@ SCENES = (
 at rest, and the first three as planes."""
 
 SWAY_DEG = 1.0  # amplitude of the rotation of a moving camera about each axis
-SWAY_PERIOD_S = 2.0  # of the rotation about y; those about x and z take longer
-PATCH_SHARES = (0.1, 0.15, 0.2, 0.25, 0.3)  # of the image, one for each scene at rest
+SWAY_PERIOD_S = 2.0  # period of the rotation about y; the rotations about x and z have longer periods
+PATCH_SHARES = (0.1, 0.15, 0.2, 0.25, 0.3)  # area of the patch over that of the image, for each scene at rest
 PLANE_FRAMES = 40
-PLANE_PATH_M = 1.2  # distance from the first to the last frame
+PLANE_PATH_M = 1.2  # distance that the camera moves past a plane, from the first to the last frame
 WRONG_INTRINSICS = ((0.93, 0.0), (0.95, 0.0), (1.05, 0.0), (1.07, 0.0), (1.0, 0.1), (1.0, 0.2))
 """Stated focal length as a multiple of the true one, and radial distortion k1 of the images that is not
 stated; one for each scene."""
@@ -74,11 +76,12 @@ RIGHT_DIRECTION_DEG = 30.0  # largest error of the direction of a right relative
 RIGHT_ROTATION_DEG = 5.0  # largest error of the rotation of a right relative pose
 
 CORRIDOR_ROOMS = 4  # length of a corridor in rooms of the simulator, 5 m each
-CORRIDOR_WIDTH_M = (1.6, 3.0)  # narrowest and widest corridor
+CORRIDOR_WIDTH_M = (1.6, 3.0)  # width of the narrowest and of the widest corridor, metres
 CORRIDOR_FRAMES = 60
-CORRIDOR_SPEED_M_S = (0.5, 1.5)  # slowest and fastest drive
+CORRIDOR_SPEED_M_S = (0.5, 1.5)  # speed of the slowest and of the fastest drive along a corridor
 PAPER_TEXEL_M = ROOM_M / 1024  # the texture of a wallpaper has 1024 texels, so that it covers a room once
-PICTURE_TEXELS = 256  # side of the textures of pictures in a world; other textures have other sizes
+# Side, in texels, of the textures of pictures in a rendered world, by which pictures are found.
+PICTURE_TEXELS = 256
 PICTURE_EVERY_M = 1.5  # distance of the pictures along each wall
 
 
@@ -168,7 +171,7 @@ def backwards(dataset: Dataset, truth: Trajectory) -> tuple[Iterator[Frame], Tra
 def make_corridor(seed: int) -> World:
     """Return a straight corridor along x with pictures on both walls, made of faces of furnished rooms.
 
-    No two of its faces look alike: each has the wallpaper of another room, which repeats after 5 m.
+    All faces look different: each has the wallpaper of another room, which repeats after 5 m.
     """
     world, rng = make_world(seed, rooms=3 * CORRIDOR_ROOMS), np.random.default_rng([seed, 4])
     floor, ceiling, wall = world.faces[:3]

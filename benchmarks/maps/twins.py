@@ -8,9 +8,10 @@ from the second room into its copy, where the lens is covered for 1 to 4 s while
 ``corridor``: a corridor that repeats every 5 m.  The lens is covered for 0.5 to 2.5 s.
 
 Each drive is tracked with depth and without (one lens).  A jump is a drive with a pose that lies nearer to an
-alias of its true place than to this place, after the unit of a drive without depth was fitted to its first
-half.  Bar: 0 jumps.  ``posed_percent`` counts the frames after the covered ones that have a pose in the first
-segment at the end.  Everything is deterministic; the number of a drive is its seed.
+alias of its true place than to this place, after the scale of a drive without depth was fitted to its first
+half.  Bar: 0 jumps, which defends the promise that degenerate input never gives a pose.  ``posed_percent``
+counts the frames after the covered ones that have a pose in the first segment at the end.  Everything is
+deterministic; the number of a drive is its seed.
 """
 
 from __future__ import annotations
@@ -38,10 +39,11 @@ KINDS = ("rooms", "known", "corridor")
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 
 ROOMS = 5  # rooms of the building
-TWIN, COPY = 1, 3  # numbers of the room that is copied, and of the copy
-STEP_M = 0.12  # distance between two frames: 0.6 m/s
+TWIN = 1  # index of the room that is copied
+COPY = 3  # index of the copy of that room
+STEP_M = 0.12  # distance that a robot moves between two frames: 0.6 m/s
 COVERED_FRAMES = (5, 20)  # fewest and most frames for which the lens is covered in a room
-FRAMES_AFTER = 25  # frames after the covered ones
+FRAMES_AFTER = 25  # number of frames after those with a covered lens
 
 CORRIDOR_PERIODS = 6  # length of the corridor in periods of 5 m
 CORRIDOR_FRAMES = 110  # frames of a drive through the corridor, with those of the covered lens
@@ -50,7 +52,7 @@ CORRIDOR_COVERED_FRAMES = (5, 25)  # fewest and most frames for which the lens i
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """A drive, of which *alias_m* is the distance of two places that look the same.
+    """A drive in which places look the same at the distance *alias_m*, metres, along x.
 
     The lens is covered in the frames from *covered_from* to before *covered_to*.
     """
@@ -176,7 +178,7 @@ def frames_of(drive: Drive, number: int) -> Iterator[Frame]:
 
 
 def row_of(drive: Drive, tracker: Tracker | MonocularTracker, frames: list[Frame]) -> dict[str, Any]:
-    """Track a drive; return whether a pose is in another place, and the share of posed frames at the end."""
+    """Track a drive; return whether a pose is at an alias, and the share of posed frames after the cover."""
     tracked = [track(tracker, frame) for frame in frames]
     truth = drive.T_world_camera[:, :3, 3]
     if isinstance(tracker, Tracker):

@@ -1,15 +1,16 @@
-"""ORB-SLAM3 beside our tracker on the same frames, with the same errors: several runs, losses included.
+"""Compare ORB-SLAM3 with our tracker on the same frames and by the same errors, in several runs.
 
     python -m venv PEER && PEER/bin/pip install pyorbslam3==0.1.1 opencv-python-headless
     python -m benchmarks peers.vocabulary ../shared/data --words words.txt
     python -m benchmarks peers.orbslam3 PEER/bin/python words.txt --folder comparison
 
 The peer runs in its own environment and process (`orbslam3_process.py`), gets images and gives trajectory
-files; nothing of it is imported here.  It is paced by its own threads, or by the time stamps at --speed times
-real time; our tracker runs as in `rse-pf compare`.  Writes ``comparison.json``, ``runs.csv`` and
-``report.md``, figures only; rows and parts that are not measured now are kept as they were.
+files; no code of the peer is imported here.  The peer gets the next frame when its threads are idle, or by
+the time stamps at --speed times real time; our tracker runs as in `rse-pf compare`.  Writes
+``comparison.json``, ``runs.csv`` and ``report.md``, figures only; rows that are not measured in this run keep
+their figures.
 
-Defends nothing: both are reported, with every run.
+There are no bars: the figures of both systems are reported, with every run and its lost frames.
 """
 
 from __future__ import annotations
@@ -71,17 +72,19 @@ Sensor = Literal["RGBD", "STEREO", "MONOCULAR"]
 _EXAMPLES = ("sift:sift", "xfeat:xfeat")
 _EXAMPLES_FOLDER = Path(__file__).resolve().parents[2] / "examples" / "features"
 _PROCESS = Path(__file__).with_name("orbslam3_process.py")
-_KITCHEN, _TURNING, _EUROC = "7scenes_redkitchen", "tum_fr1_rpy_start", "euroc_mh01_start"
-_KITTI_STEREO, _KITTI = "kitti_06_start", "kitti_00_left_start"
-_LONGEST_S = 600.0
-_AS_MANY = 0.95
-"""A run with this share of our poses has as many."""
-_MAX_STAMP_DIFFERENCE_S = 0.02
-_DEPTH_BASELINE_M, _TOO_FAR = 0.08, 40.0
-"""A Kinect's baseline, and the baselines beyond which a point is far: the values of ORB-SLAM3's examples."""
+_KITCHEN = "7scenes_redkitchen"  # recording with depth
+_TURNING = "tum_fr1_rpy_start"  # recording with depth of a camera that turns quickly
+_EUROC = "euroc_mh01_start"  # stereo recording
+_KITTI_STEREO = "kitti_06_start"  # stereo recording
+_KITTI = "kitti_00_left_start"  # recording of one camera
+_LONGEST_S = 600.0  # time limit of one run of the peer
+_MIN_POSES_SHARE = 0.95  # smallest share of our number of poses at which the peer has about as many
+_MAX_STAMP_DIFFERENCE_S = 0.02  # largest difference of the time stamps of a pose and of its true pose
+_DEPTH_BASELINE_M = 0.08  # baseline of a Kinect in ORB-SLAM3's examples
+_TOO_FAR = 40.0  # distance, in baselines, from which ORB-SLAM3's examples count a point as far
+# Number of ORB features of an image by sensor, as in ORB-SLAM3's examples.
 _FEATURES: dict[Sensor, int] = {"RGBD": 1000, "STEREO": 1200, "MONOCULAR": 1000}
-_FEATURES_OF_KITTI = 2000
-"""As in ORB-SLAM3's examples for these recordings."""
+_FEATURES_OF_KITTI = 2000  # number of ORB features of an image of KITTI, as in ORB-SLAM3's examples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,9 +104,10 @@ class Options:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A recording at a rate with a sensor; our configuration beside it, empty where we have none.
+    """A recording at several rates with a sensor, and the name of our configuration that is compared.
 
-    ``features`` are examples of features, which are compared, too.
+    ``ours`` is empty if no configuration of ours is compared.  ``features`` names examples of feature plugins
+    that are compared as well.
     """
 
     recording: str
@@ -127,7 +131,7 @@ ROWS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Job:
-    """What the peer gets: its settings, the images, and the pose of its camera in ours and in the body."""
+    """The input of the peer: its settings, the images, and the pose of its camera in ours and in the body."""
 
     settings: str
     frames: list[tuple[float, str, str | None]]
@@ -257,7 +261,7 @@ def _yaml(lens: Intrinsics, sensor: Sensor, rate_hz: float, more: Sequence[str])
 
 
 def _rectified_yaml(lens: Intrinsics, rate_hz: float, baseline_fx: float) -> str:
-    """Return the older form of the settings of a rectified pair: the newer one crashes the peer (0.1.1)."""
+    """Return the older form of the settings of a rectified pair; the newer form crashes version 0.1.1."""
     camera = lens.camera
     lines = [
         "%YAML:1.0", 'Camera.type: "PinHole"', *_lens("Camera", lens),
@@ -362,11 +366,11 @@ def _summary_of(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _is_behind(ours: dict[str, Any] | None, best: dict[str, Any] | None) -> bool:
-    """Whether the best run of the peer has more poses, or about as many with a lower error."""
+    """Return whether the peer's best run has more poses than ours, or about as many and a lower error."""
     if ours is None or best is None:
         return ours is None
     is_nearer = best["ate_cm"] is not None and best["ate_cm"] < (ours["ate_cm"] or np.inf)
-    has_as_many = best["posed"] >= _AS_MANY * ours["posed"]
+    has_as_many = best["posed"] >= _MIN_POSES_SHARE * ours["posed"]
     return bool(best["posed"] > ours["posed"] or (has_as_many and is_nearer))
 
 
@@ -377,7 +381,7 @@ def _pace(speed: float) -> str:
 
 
 def _rows_of(row: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """Yield the lines of a recording: ours, and each run of the peer."""
+    """Yield the lines of a recording in ``runs.csv``: our run, and each run of the peer."""
     about = (row["name"], row["frames"], f"{row['sensor'].lower()}, {row['alignment']}")
     ours = row.get("ours")
     if ours is None:
@@ -403,7 +407,7 @@ def _rows_of(row: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
 
 
 def _cpu(run: dict[str, Any]) -> str:
-    """Return the peer's CPU of a frame; unknown where looking at its threads was not counted apart."""
+    """Return the CPU time of the peer for a frame; unknown if it includes the polling of its threads."""
     return f"{run['cpu_ms_a_frame']:.0f}" if "looking_ms_a_frame" in run else "not known"
 
 
@@ -456,7 +460,7 @@ def run_benchmark(args: Options) -> dict[str, Any]:
 def _measured(
     args: Options, row: Row, drive: Drive, own: Drive, earlier: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return what is measured now of a row, ours on *own*; with --more, after *earlier* runs of the peer."""
+    """Measure a row, our tracker on *own*; with --more, add the peer's runs to the *earlier* ones."""
     before = earlier if args.more else ()
     measured: dict[str, Any] = {
         "name": drive.name, "sensor": row.sensor, "frames": len(drive.dataset),
@@ -476,8 +480,6 @@ def _measured(
 def _about_peer(args: Options) -> str:
     """Return the version of the peer and the size of its vocabulary."""
     version = ["-c", "from importlib.metadata import version; print(version('pyorbslam3'))"]
-    told = subprocess.run([str(args.python), *version], capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run([str(args.python), *version], capture_output=True, text=True, check=True).stdout
     words = sum(line.split()[1] == "1" for line in args.vocabulary.read_text().split("\n")[1:])
-    return (
-        f"pyorbslam3 {told.strip()} with a vocabulary of {words} words, trained on images of these recordings"
-    )
+    return f"pyorbslam3 {printed.strip()} with a vocabulary of {words} words, trained on these recordings"

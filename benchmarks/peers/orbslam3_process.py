@@ -1,10 +1,10 @@
-"""Feed one recording to ORB-SLAM3, and write the trajectories that it gives: the process of the peer.
+"""Feed one recording to ORB-SLAM3, and write its trajectories; runs in the process of ORB-SLAM3, the peer.
 
-Runs only in the peer's own virtual environment, by a path; nothing of this project is imported here, and
-nothing here is imported by it.  A job is a JSON file: ``vocabulary``, ``settings`` (YAML), ``sensor``,
-``speed``, ``frames`` (time stamp, image, and depth or right image) and ``out``.  A speed of 1 plays in real
-time; with 0, each frame is given as soon as all threads of the peer rest, so that a busy machine costs it
-nothing.
+The file runs only in the peer's own virtual environment, by its path.  This file imports no code of this
+project, and no module of the project imports this file.  A job is a JSON file: ``vocabulary``, ``settings``
+(YAML), ``sensor``, ``speed``, ``frames`` (time stamp, image, and depth or right image) and ``out``.  A speed
+of 1 plays in real time; with 0, each frame is passed as soon as all threads of the peer are idle, so that a
+busy machine does not harm the results.
 
 Writes ``online.txt``, the poses as they were returned, ``final.txt``, those of the largest map at the end,
 and ``figures.json``.  Poses are of the left camera; TUM format, seconds.
@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 import pyorbslam3
 
-# Checks in a row that have to find all threads idle, and longest wait for that, seconds.
-RESTS, LONGEST_REST_S = 3, 1.0
+IDLE_CHECKS = 3  # successive checks that have to find all threads idle before the next frame is passed
+MAX_IDLE_WAIT_S = 1.0  # longest wait for idle threads
 
 
 def run_job(job_path):
@@ -83,8 +83,8 @@ def wait_until_all_rest():
     Threads are checked every 4 ms, and have to be idle in three checks in a row.  After one second the
     function returns although threads still run.
     """
-    looks, end = 0, time.monotonic() + LONGEST_REST_S
-    while looks < RESTS and time.monotonic() < end:
+    looks, end = 0, time.monotonic() + MAX_IDLE_WAIT_S
+    while looks < IDLE_CHECKS and time.monotonic() < end:
         time.sleep(0.004)
         looks = looks + 1 if not any(is_running(task) for task in Path("/proc/self/task").iterdir()) else 0
 

@@ -1,7 +1,8 @@
 """Train a vocabulary for ORB-SLAM3 from images, as the text file that its library DBoW2 reads.
 
 ORB features of each image are clustered into a tree of 10 branches and 6 levels, by k-medians of bits; a word
-weighs the logarithm of images over images that show it.  Deterministic: the same images give the same file.
+has the weight ``log(number of images / number of images that show the word)``.  The same images give the same
+file.
 The file belongs to the images, and is not committed.
 
     python -m benchmarks peers.vocabulary ../shared/data --every 5 --words words.txt
@@ -28,12 +29,13 @@ __all__ = ["Node", "text_of", "train"]
 
 Bits = npt.NDArray[np.uint8]
 
-_BRANCHES, _LEVELS, _ROUNDS = 10, 6, 8
-_LEAST_SPLIT = 24
-"""A cluster of fewer descriptors is a word."""
-_FEATURES = 1000
-_TF_IDF, _L1 = 0, 0
-"""As DBoW2 numbers weighting and scoring."""
+_BRANCHES = 10  # number of clusters into which a node of the vocabulary tree is divided
+_LEVELS = 6  # number of levels of the vocabulary tree below its root
+_ROUNDS = 8  # largest number of iterations of a clustering
+_MIN_SPLIT = 24  # fewest descriptors of a cluster that is divided further; a smaller cluster is a word
+_FEATURES = 1000  # number of ORB features of an image
+_TF_IDF = 0  # DBoW2's number of the weighting TF-IDF
+_L1 = 0  # DBoW2's number of the score by the L1 distance
 _FOLDERS = ("rgb", "image_0", "data")
 """Folders of colour or grey images in the layouts of TUM, KITTI and EuRoC."""
 
@@ -55,12 +57,12 @@ def train(descriptors: Bits, images: npt.NDArray[np.int64]) -> list[Node]:
 
     Args:
         descriptors: ``(n, 32)``.
-        images: ``(n,)``, the number of the image that shows each of them, from 0.
+        images: ``(n,)``, for each descriptor the number of the image that shows it, from 0.
     """
     rng = np.random.default_rng(0)
     nodes = [Node(np.zeros(32, np.uint8), parent=0, rows=np.arange(len(descriptors)), depth=0)]
     for number, node in enumerate(nodes):  # the list grows while it is read: breadth first
-        if node.depth < _LEVELS and len(node.rows) >= _LEAST_SPLIT:
+        if node.depth < _LEVELS and len(node.rows) >= _MIN_SPLIT:
             for centre, rows in _split(descriptors, node.rows, rng):
                 node.children.append(len(nodes))
                 nodes.append(Node(centre, parent=number, rows=rows, depth=node.depth + 1))
@@ -71,7 +73,7 @@ def train(descriptors: Bits, images: npt.NDArray[np.int64]) -> list[Node]:
 
 
 def text_of(nodes: Sequence[Node]) -> str:
-    """Return the tree as DBoW2's text; its reader takes an empty last line for a node, so there is none."""
+    """Return the tree as text for DBoW2, without a last newline: DBoW2 would read an empty line as a node."""
     lines = [f"{_BRANCHES} {_LEVELS} {_L1} {_TF_IDF}"]
     for node in nodes[1:]:
         bits = " ".join(map(str, node.descriptor))
@@ -82,7 +84,7 @@ def text_of(nodes: Sequence[Node]) -> str:
 def _split(
     descriptors: Bits, rows: npt.NDArray[np.int64], rng: np.random.Generator
 ) -> Iterator[tuple[Bits, npt.NDArray[np.int64]]]:
-    """Yield the centre and the rows of each cluster of *rows*; nothing if they cannot be told apart."""
+    """Divide the descriptors *rows* into clusters; yield centre and rows of each (none if all are equal)."""
     signs = np.unpackbits(descriptors[rows], axis=1).astype(np.float32) * 2 - 1
     centres = signs[rng.choice(len(rows), size=min(_BRANCHES, len(rows)), replace=False)]
     owner = np.zeros(len(rows), dtype=np.int64)

@@ -1,18 +1,21 @@
-"""How many robots one server carries: at 5 frames a second each, and 10,000 of which few are active.
+"""Measure how many active robots one server carries, and the memory of 10,000 mostly idle robots.
 
     python -m benchmarks server.capacity [--workers 1 2] [--codec bin] [--balancer] [--connected 10000]
 
-Real PnP (200 matches, 30 % wrong, every frame kept), open loop: send times are fixed before each step, and
-latency counts from the planned time.  A step carries its robots if every command of its window returned a
-pose, with p99 <= 150 ms.  The number is doubled until a step fails twice, and then bisected to 7 %.  Robots,
-server and load generator share the cores.  With ``--balancer`` the robots connect through Envoy to one server
-of one worker for each of *workers*, with tokens.
+Each active robot sends 5 real PnP commands a second (200 matches, 30 % wrong, no frame is dropped) in an open
+loop: send times are fixed before each step, and latency counts from the planned time.  A server carries the
+robots of a step if every command in the step's window returned a pose, with a p99 of the latency <= 150 ms.
+The number is doubled until a step fails twice, and then bisected to 7 %.  Robots, server and load generator
+share the cores.  With ``--balancer`` the robots connect through Envoy to one server of one worker for each of
+*workers*, with tokens.
 
 Then 10,000 robots are connected, of which 500 send one frame a second and the others a ping every 2 s, as
-the SDK does; memory is that which only the server's processes use, growth since before the first robot.
+the SDK does.  The figure is the growth of the private memory of the server's processes since before the first
+robot.
 
-Defends: two workers on two cores carry >= 1,000 robots at 5 frames a second; 10,000 connected robots need
-<= 16 KiB each, and of the active ones none fails.
+Defends the promises that 10,000 connections need at most 16 KiB each and that the capacity does not shrink:
+two workers on two cores carry >= 1,000 robots at 5 frames a second, and no command of the active ones of
+10,000 connected robots fails.
 """
 
 from __future__ import annotations
@@ -55,24 +58,24 @@ once; every other limit is the default."""
 
 FRAMES_PER_S = 5.0
 """Frames that each robot sends in a second: the rate of the paper (Sect. 6.2)."""
-# Largest p99 of the latency, ms, at which robots count as carried; fewest robots that two workers have to
-# carry; largest memory of a connected robot, KiB.
-P99_BAR_MS, ROBOTS_BAR, KIB_BAR = 150.0, 1000, 16.0
-# Robots of the first step of a search, and largest number that is tried.
-FIRST, MOST = 250, 8000
+MAX_P99_MS = 150.0  # largest p99 of the latency at which the robots of a step count as carried
+MIN_ROBOTS = 1000  # bar: fewest robots that two workers have to carry
+MAX_KIB_PER_ROBOT = 16.0  # bar: largest memory of a connected robot
+FIRST_ROBOTS = 250  # number of robots of the first step of a search
+MAX_ROBOTS = 8000  # largest number of robots that a search tries
 PRECISION = 1.07  # a search ends at this ratio of the fewest robots that failed to the most that were carried
 CONNECTED = 10_000  # robots that are connected after the searches
-CONNECTED_TO_ONE_ACTIVE = 20  # of 10,000 connected robots 500 are active
-PING_EVERY_S = 2.0  # time between two pings of a robot that is not active
-SOURCES = 8  # addresses from which the robots connect
+CONNECTED_TO_ONE_ACTIVE = 20  # number of connected robots for each active one: 500 of 10,000 are active
+PING_EVERY_S = 2.0  # time between two pings of an idle robot
+SOURCES = 8  # number of loopback addresses from which the robots connect
 WARM_UP_S = 1.0  # time at the beginning of a step that is not measured
 DRAIN_S = 1.0  # time after a step in which answers still count
-SEARCH_S = 85.0  # no step begins after this time of a search
+SEARCH_S = 85.0  # time, from the begin of a search, after which no further step begins
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServingSite:
-    """Where robots connect, and how many processes serve them."""
+    """The port and path to which robots connect, and the number of worker processes that serve them."""
 
     port: int
     path: str
@@ -97,8 +100,8 @@ class CapacityStep:
 
     @property
     def is_carried(self) -> bool:
-        """Whether every command returned a pose in time."""
-        return self.ok > 0 and not (self.failed or self.lost or self.unsent) and self.p99_ms <= P99_BAR_MS
+        """Whether every command returned a pose, and the p99 of the latency is at most `MAX_P99_MS`."""
+        return self.ok > 0 and not (self.failed or self.lost or self.unsent) and self.p99_ms <= MAX_P99_MS
 
 
 def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: float) -> CapacityStep:
@@ -120,9 +123,9 @@ def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: floa
 def search(
     try_robots: Callable[[int], CapacityStep], clock: Callable[[], float], search_s: float
 ) -> list[CapacityStep]:
-    """Search the largest number of robots that is carried; return all steps in their order.
+    """Search the largest number of robots that a server carries; return all steps in their order.
 
-    The number is doubled from `FIRST` until a step fails twice, then bisected to `PRECISION`.
+    The number is doubled from `FIRST_ROBOTS` until a step fails twice, then bisected to `PRECISION`.
 
     Args:
         try_robots: Makes a step with a number of robots.
@@ -140,8 +143,8 @@ def search(
                 break
         return steps[-1].is_carried
 
-    carried, failed, robots = 0, 0, FIRST
-    while not failed and robots <= MOST and clock() < until:
+    carried, failed, robots = 0, 0, FIRST_ROBOTS
+    while not failed and robots <= MAX_ROBOTS and clock() < until:
         if is_carried(robots):
             carried, robots = robots, 2 * robots
         else:
@@ -158,7 +161,7 @@ def search(
 def most_robots(workers: int, codec: str, seconds: float, search_s: float) -> dict[str, Any]:
     """Return the most robots that a server of *workers* processes carries, connected without a balancer.
 
-    Robots are carried if each of their commands returned a pose, with a p99 of at most `P99_BAR_MS`.
+    Robots are carried if each of their commands returned a pose, with a p99 of at most `MAX_P99_MS`.
 
     Args:
         workers: Worker processes of the server.
@@ -177,7 +180,7 @@ def most_robots(workers: int, codec: str, seconds: float, search_s: float) -> di
 async def most_robots_behind_balancer(
     servers: int, codec: str, seconds: float, search_s: float
 ) -> dict[str, Any]:
-    """Return the same as `most_robots` for robots that connect through Envoy, with tokens.
+    """Return the most robots, as `most_robots` does, for robots that connect through Envoy with tokens.
 
     Behind Envoy are *servers* servers of one worker each.
     """
@@ -186,7 +189,7 @@ async def most_robots_behind_balancer(
         folder = Path(made)
         async with LocalPlatform(settings, state=folder / "state", port=0, servers=servers) as cloud:
             tokens = folder / "tokens"
-            names = [cloud.issue_token(f"robot-{number}") for number in range(MOST)]
+            names = [cloud.issue_token(f"robot-{number}") for number in range(MAX_ROBOTS)]
             tokens.write_text("\n".join(names))
             site = ServingSite(port=cloud.port, path="/ws", workers=servers, tokens=tokens)
             return await asyncio.to_thread(find_capacity, site, folder, codec, seconds, search_s)
@@ -199,7 +202,7 @@ def find_capacity(
 
     *seconds* and *search_s* are as in `most_robots`.
     """
-    step(site, folder, codec, 20, 1.0)  # warms it up
+    step(site, folder, codec, 20, 1.0)  # warms the server up
     steps = search(lambda robots: step(site, folder, codec, robots, seconds), time.monotonic, search_s)
     most = max((tested.robots for tested in steps if tested.is_carried), default=0)
     return {"workers": site.workers, "robots": most, "steps": [asdict(tested) for tested in steps]}
@@ -223,7 +226,7 @@ def measure_connected(codec: str, seconds: float, connected: int) -> dict[str, A
             group_of(LoadScenario(robots=active, fps=1.0, codec=codec), folder, "active"),
         )  # fmt: skip
         site = ServingSite(port=server.port, path="/ws", workers=2)
-        step(site, folder, codec, 20, 1.0)  # warms it up
+        step(site, folder, codec, 20, 1.0)  # warms the server up
         memory["before"] = private_bytes_of_tree(server.pid)
 
         def at(mark: str) -> None:
@@ -257,8 +260,8 @@ def serving(workers: int) -> Iterator[tuple[BenchServer, Path]]:
 
 
 @benchmark(
-    Bar("robots_carried.2", at_least=ROBOTS_BAR, unit="robots at 5 fps"),
-    Bar("connected.kib_per_robot", at_most=KIB_BAR, unit="KiB"),
+    Bar("robots_carried.2", at_least=MIN_ROBOTS, unit="robots at 5 fps"),
+    Bar("connected.kib_per_robot", at_most=MAX_KIB_PER_ROBOT, unit="KiB"),
     Bar("connected.active.failed", at_most=0),
     Bar("connected.active.lost", at_most=0),
 )

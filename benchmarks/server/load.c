@@ -1,4 +1,4 @@
-/* Load a WebSocket server on loopback from one thread, and print what came of it as one JSON object.
+/* Load a WebSocket server on loopback from one thread, and print the outcome as one JSON object.
 
    benchmarks/server/load.py compiles it and writes its payload files; `load --help` prints the options.
 
@@ -6,15 +6,15 @@
    random phase each, from a seed), or as soon as it is answered (closed loop).  Both loops begin when all
    robots are connected; an early group is an open loop that begins at once, such as the pings of robots that
    wait for others.  In an open loop, latency counts from the planned time, so a server that stalls cannot
-   hide it; how late this program itself sent is reported beside it.
+   hide it; the delay with which this program itself sent is reported separately.
 
    Answers are matched by their `id`: message k of a payload file has the id k.  An answer without id belongs
    to the oldest unanswered message of its connection.
 
-   With --obey 1 a robot that is told `retry_after_ms` sends nothing until then; what it
-   leaves out counts as unsent, so as offered.
+   With --obey 1 a robot that receives `retry_after_ms` sends nothing for that time; the messages that it
+   leaves out count as unsent, and so as offered.
 
-   It connects to 127.0.0.0/8 only, ends at a deadline whatever happens, and does not check poses. */
+   The program connects to 127.0.0.0/8 only, exits at a deadline in any case, and does not check poses. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <ctype.h>
@@ -40,10 +40,10 @@
 enum {
   MAX_GROUPS = 8,
   MAX_FRAMES = 1024,
-  MAX_QUEUED = 8,             /* frames that one connection has not taken yet; more are not sent */
-  MAX_MESSAGE = 1 << 20,      /* longest message of a server */
+  MAX_QUEUED = 8,             /* most frames that wait for one connection; more are not sent */
+  MAX_MESSAGE = 1 << 20,      /* bytes of the longest message of a server */
   MAX_CODES = 64,
-  HEAD_BYTES = 160,           /* type and id of an answer stand within its first bytes */
+  HEAD_BYTES = 160,           /* type and id of an answer stand within these first bytes */
   EVENTS = 1024,
 };
 
@@ -79,14 +79,14 @@ typedef struct {
 typedef struct {
   char name[32];
   Mode mode;
-  int robots, first; /* number of its first robot */
-  double rate, begin_s; /* when its first turn may begin */
+  int robots, first; /* number of robots of the group, and index of its first robot */
+  double rate, begin_s; /* messages a second of a robot, and when its first turn may begin */
   Frame *frames;
   int frame_count;
   int *order; /* robots of the group, by phase */
   double *phase_s;
   uint64_t turn;    /* sends planned so far, over all robots */
-  double *planned; /* of each robot and message: when it was to be sent, 0 where it is not unanswered */
+  double *planned; /* of each robot and message: planned send time, 0 if it was not sent or is answered */
   Floats latency_s, late_s;
   uint64_t outcomes[4];
   uint64_t answered_in_window;
@@ -99,7 +99,7 @@ typedef struct {
   int next_frame, unanswered;
   uint16_t queue[MAX_QUEUED];
   int queued;
-  size_t offset; /* bytes of queue[0] that are sent */
+  size_t offset; /* bytes of queue[0] that have been sent */
   bool says_hello, waits_for_room, is_settled;
   uint8_t *partial;
   size_t partial_size, partial_capacity;
@@ -138,8 +138,8 @@ static Frame *hello;
 static int poller;
 static double begin_s, first_s = INFINITY, last_s = INFINITY; /* the window is [first_s, last_s) */
 static int opening, ready_count;
-static int settled; /* robots that were connected once, or are given up */
-static int *waiting; /* robots to connect, a ring in order of time */
+static int settled; /* number of robots that have been connected once, or were given up */
+static int *waiting; /* robots that have to connect: a ring buffer in the order of time */
 static int waiting_head, waiting_count;
 static uint64_t refused[600], unmatched;
 static Counted closed_by[MAX_CODES], codes[MAX_CODES];
@@ -360,7 +360,7 @@ static void send_next(Robot *robot, double planned_s) {
   int k = robot->next_frame;
   robot->next_frame = (k + 1) % group->frame_count;
   if (planned[k]) {
-    note(group, LOST, planned[k], NAN, NAN); /* its id is used again */
+    note(group, LOST, planned[k], NAN, NAN); /* the id is used again by a later message */
     robot->unanswered--;
   }
   planned[k] = planned_s;
@@ -467,7 +467,7 @@ static void count_code(const uint8_t *data, size_t size) {
   if (quote) count(codes, (const char *)at, (size_t)(quote - at));
 }
 
-/* Read type and id of a JSON message; *id stays -1 where it has none. */
+/* Read type and id of a JSON message; *id stays -1 in a message without an id. */
 static Answer read_json(const uint8_t *data, size_t size, bool is_peer, long *id) {
   const uint8_t *over = data + size, *at = after(data, size, "\"id\":", 5);
   if (at && at < over && *at >= '0' && *at <= '9') {
@@ -482,7 +482,7 @@ static Answer read_json(const uint8_t *data, size_t size, bool is_peer, long *id
   return answer;
 }
 
-/* The same of a MessagePack map whose strings are short. */
+/* Read type and id of a MessagePack map whose strings are short; *id stays -1 without an id. */
 static Answer read_msgpack(const uint8_t *data, size_t size, long *id) {
   const uint8_t *over = data + size, *at = after(data, size, "\xa2id", 3);
   if (at && at < over) {
@@ -500,7 +500,7 @@ static Answer read_msgpack(const uint8_t *data, size_t size, long *id) {
   return answer;
 }
 
-/* The whole of a rare message as text, or in MessagePack as it is; its size in *size. */
+/* Return a whole message, as inflated text or as MessagePack, and its size in *size; for rare messages. */
 static const uint8_t *whole(const uint8_t *data, size_t *size) {
   static uint8_t text[8192];
   if (option.reply == REPLY_MSGPACK) return data;
@@ -510,7 +510,7 @@ static const uint8_t *whole(const uint8_t *data, size_t *size) {
   return text;
 }
 
-/* A number of a `whole` message by its name, of less than 32 letters; 0 where it has none. */
+/* Return the number with a name (below 32 letters) in a `whole` message; 0 if there is none. */
 static double number_of(const uint8_t *text, size_t size, const char *name) {
   char mark[40];
   bool is_text = option.reply != REPLY_MSGPACK;
@@ -542,7 +542,7 @@ static Answer read_answer(const uint8_t *data, size_t size, long *id) {
   }
 }
 
-/* Take the end of message *id*, or of the oldest one where it is -1. */
+/* Record the end of message *id*, or of the oldest unanswered message if *id* is -1. */
 static void take_end(Robot *robot, long id, Outcome outcome, double at_s) {
   Group *group = robot->group;
   double *planned = group->frame_count ? planned_of(robot) : NULL;
@@ -589,7 +589,7 @@ static void take_frame(Robot *robot, int opcode, const uint8_t *data, size_t siz
   }
 }
 
-/* Take the answer to the handshake; returns the bytes used, 0 where it is incomplete. */
+/* Process the answer to the handshake; return the bytes used, 0 if the answer is incomplete. */
 static size_t take_head(Robot *robot, const uint8_t *data, size_t size) {
   const uint8_t *rest = after(data, size, "\r\n\r\n", 4);
   if (!rest) {
@@ -612,7 +612,7 @@ static size_t take_head(Robot *robot, const uint8_t *data, size_t size) {
   return (size_t)(rest - data);
 }
 
-/* Take every complete frame; returns the bytes used. */
+/* Process every complete frame; return the bytes used. */
 static size_t take_frames(Robot *robot, const uint8_t *data, size_t size, double at_s) {
   size_t used = 0;
   while (robot->state >= UPGRADING) {
@@ -707,7 +707,7 @@ static double next_event_s(double now) {
   return next;
 }
 
-/* Let the groups begin that waited until all robots were connected, and set the window. */
+/* Begin the groups that waited until all robots were connected, and set the measured window. */
 static void begin_loops(double now) {
   first_s = now + option.warm_up_s;
   last_s = first_s + option.seconds;
@@ -716,7 +716,7 @@ static void begin_loops(double now) {
     if (robot->state == READY && robot->group->mode == CLOSED_LOOP) send_next(robot, now);
 }
 
-/* Wait for sockets until a time, to the microsecond, where epoll_wait has milliseconds. */
+/* Wait for sockets until a time with microseconds, since epoll_wait has only milliseconds. */
 static void take_events(double until_s) {
   static struct epoll_event events[EVENTS];
   double pause_s = fmin(fmax(until_s - now_s(), 0), 0.05);
@@ -802,7 +802,7 @@ static void print_report(double opened_s, double cpu_s, bool is_late) {
 
 /* ---- options ---- */
 
-static double *phases; /* of the group that is sorted */
+static double *phases; /* phases of the group that is being sorted */
 
 static int by_phase(const void *a, const void *b) {
   double x = phases[*(const int *)a], y = phases[*(const int *)b];
@@ -958,7 +958,7 @@ int main(int argc, char **argv) {
       first_s = fmin(first_s, now);
       last_s = now;
     }
-    send_due(now); /* before the end is judged: what was planned within the window is sent */
+    send_due(now); /* before the end is checked, so that every message planned in the window is sent */
     if (!has_ended && now >= last_s) {
       has_ended = true;
       cpu_s = own_cpu_s() - cpu_begin_s;

@@ -1,8 +1,8 @@
 """The load generator `load.c` from Python: compile it at first use, write its files, run it, read its report.
 
 `compile_generator` raises ConfigurationError without a C compiler; a benchmark then says so and is skipped.
-`run_load` waits for a run of fixed length.  `LoadProcess` is one that a benchmark ends itself, and whose
-samples are cut into windows afterwards.  Both end with their caller, and connect to loopback only.
+`run_load` waits for a run of fixed length.  `LoadProcess` is a run that a benchmark stops itself, and whose
+samples are divided into windows afterwards.  Both are killed with their caller, and connect to loopback only.
 """
 
 from __future__ import annotations
@@ -45,17 +45,20 @@ LIBRARIES = ("-lz", "-lm")
 SAMPLE = np.dtype(
     [("planned_s", "<f8"), ("latency_s", "<f4"), ("late_s", "<f4"), ("group", "<u4"), ("outcome", "<u4")]
 )
-"""One message of a samples file; times by the monotonic clock, latency NaN where there was no answer."""
+"""One message in a file of samples: times of the monotonic clock; the latency is NaN without an answer."""
 OUTCOMES = ("ok", "failed", "lost", "unsent")
-"""What *outcome* of `SAMPLE` counts."""
+"""Names of the values of the field *outcome* of `SAMPLE`."""
 
 _BUILD = Path(__file__).resolve().parents[2] / "build" / "benchmarks"
-_COMPILE_S, _MARGIN_S, _OPENING_S = 60.0, 20.0, 60.0
+_COMPILE_S = 60.0  # time limit for compiling the generator
+_MARGIN_S = 20.0  # time beyond the plan in which the generator has to exit
+_OPENING_S = 60.0  # time limit in which all robots have to connect
+# How the generator decodes answers, by codec.
 _REPLIES = {"zlib": "zlib", "json": "json", "bin": "msgpack", "peer": "peer"}
 
 
 def compile_generator(folder: Path = _BUILD) -> Path:
-    """Return the compiled generator, compiling it where *folder* lacks this version.
+    """Return the compiled generator; compile it if *folder* does not have this version.
 
     Raises:
         ConfigurationError: There is no C compiler, or it cannot compile the source.
@@ -81,23 +84,23 @@ def compile_generator(folder: Path = _BUILD) -> Path:
 
 
 def write_messages(file: Path, messages: Iterable[bytes]) -> Path:
-    """Write *messages*, each after its length; message k must have the id k.  Return *file*."""
+    """Write *messages* to *file*, each after its length, and return *file*; message k must have the id k."""
     file.write_bytes(b"".join(struct.pack("<I", len(message)) + message for message in messages))
     return file
 
 
 def hello_file(folder: Path, codec_name: str) -> Path:
-    """Write the first message of a robot; return its file."""
+    """Write a file with the Hello of a robot, and return its path."""
     return _encode(folder / f"hello.{codec_name}", codec_name, [Hello()])
 
 
 def ping_file(folder: Path, codec_name: str) -> Path:
-    """Write the ping of a robot; return its file."""
+    """Write a file with the ping of a robot, and return its path."""
     return _encode(folder / f"ping.{codec_name}", codec_name, [Ping(sent_s=1.0)])
 
 
 def command_file(folder: Path, scenario: LoadScenario) -> Path:
-    """Write the commands of a robot of *scenario*, as the SDK sends them; return their file."""
+    """Write a file with the commands of a robot of *scenario*, as the SDK sends them; return its path."""
     codec, session = make_codec(scenario.codec), SessionSettings()
     commands = [
         Command(
@@ -117,7 +120,7 @@ def _encode(file: Path, codec_name: str, messages: Sequence[Message]) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotGroup:
-    """Robots that send alike: *rate* messages a second each (open loop), or as fast as they are answered."""
+    """Robots with the same load: *rate* messages a second each (open loop), or one after each answer."""
 
     name: str
     robots: int
@@ -126,7 +129,7 @@ class RobotGroup:
     payload: Path | None = None
 
     def option(self) -> str:
-        """Return the group as `load` reads it."""
+        """Return the group as an argument of the program `load`."""
         return f"{self.name}:{self.robots}:{self.mode}:{self.rate:g}:{self.payload or '-'}"
 
 
@@ -156,10 +159,10 @@ class LoadPlan:
     seed: int = 1
     samples: Path | None = None
     obeys: bool = False
-    """Whether robots wait as failures say; what they leave out is unsent."""
+    """Whether robots wait as failures demand; commands that they leave out count as unsent."""
 
     def command(self, program: Path) -> list[str]:
-        """Return the command line."""
+        """Return the command line that runs this plan."""
         values: dict[str, object] = {
             "port": self.port, "path": self.path, "reply": _REPLIES[self.codec], "seconds": self.seconds,
             "warm-up": self.warm_up_s, "drain": self.drain_s, "opening": self.opening_s,
@@ -180,11 +183,11 @@ def group_of(scenario: LoadScenario, folder: Path, name: str = "robots") -> Robo
     """Return the robots of *scenario*; their commands are written to *folder*.
 
     Raises:
-        ConfigurationError: It has a link, which this generator does not emulate.
+        ConfigurationError: *scenario* has an emulated network link, which this generator does not support.
     """
     if scenario.link is not None:
         raise ConfigurationError(
-            f"the load generator in C emulates no link ({scenario.link})", hint="drive it by rse-pf swarm"
+            f"the load generator in C emulates no network link ({scenario.link})", hint="use rse-pf swarm"
         )
     return RobotGroup(
         name=name, robots=scenario.robots, mode="early" if scenario.join_every_s else "open",
@@ -204,7 +207,7 @@ def plan_of(scenario: LoadScenario, folder: Path, port: int) -> LoadPlan:
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Percentiles of times, ms; NaN without any."""
+    """Percentiles of times, ms; NaN without times."""
 
     n: int
     p50: float
@@ -215,7 +218,7 @@ class Percentiles:
 
     @classmethod
     def of(cls, document: dict[str, Any]) -> Percentiles:
-        """Return what a report says."""
+        """Return the percentiles in *document*, an object of a report."""
         names = ("p50", "p95", "p99", "p999", "max")
         return cls(
             document["n"], *(math.nan if document[name] is None else float(document[name]) for name in names)
@@ -224,10 +227,10 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroupReport:
-    """What came of the messages that one group planned within the window.
+    """The outcomes of the messages that one group planned within the window.
 
-    *lost* ones were sent and not answered, *unsent* ones found no open connection.  *late_ms* is how late
-    this generator itself sent.  *answered_in_window* counts answers by the time of their arrival.
+    *lost* messages were sent and not answered; for *unsent* ones there was no open connection.  *late_ms* is
+    how late this generator itself sent.  *answered_in_window* counts answers by the time of their arrival.
     """
 
     name: str
@@ -243,7 +246,7 @@ class GroupReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReport:
-    """What came of a run; *closed*, *refused* and *codes* count closes, handshake statuses, failure codes."""
+    """The result of a run; *closed*, *refused*, *codes* count closes, handshake statuses, failure codes."""
 
     robots: int
     connected: int
@@ -259,7 +262,7 @@ class LoadReport:
 
     @classmethod
     def from_json(cls, text: str) -> LoadReport:
-        """Read what the generator printed."""
+        """Parse the output of the generator."""
         document = json.loads(text)
         groups = tuple(
             GroupReport(
@@ -271,12 +274,12 @@ class LoadReport:
         return cls(**{**document, "window_s": tuple(document["window_s"]), "groups": groups})
 
     def group(self, name: str) -> GroupReport:
-        """Return the report of one group."""
+        """Return the report of the group *name*."""
         return next(group for group in self.groups if group.name == name)
 
 
 class LoadProcess:
-    """``with LoadProcess(plan) as load``: a generator that runs until `stop`, or for the plan's time.
+    """A running generator: ``with LoadProcess(plan) as load`` runs it until `stop`, or for the plan's time.
 
     *on_mark* is called in a thread with ``begin`` and ``end`` when the window begins and ends.
     """
@@ -309,7 +312,7 @@ class LoadProcess:
         self._process.stdout.close()
 
     def wait_begun(self) -> None:
-        """Wait until the window begins; raises ConfigurationError if it does not in time."""
+        """Wait until the window begins; raises ConfigurationError if it does not begin in time."""
         limit_s = self.plan.opening_s + self.plan.warm_up_s + _MARGIN_S
         if not self._begun.wait(limit_s) or self._process.poll() not in (None, 0):
             raise ConfigurationError("the load generator did not begin", hint=" ".join(self._errors)[-300:])

@@ -1,21 +1,24 @@
-"""What the clients in three languages offer to a small server that twice as many robots use as it can serve.
+"""Measure the load that clients in three languages offer to a server with twice the robots that it can serve.
 
     python -m benchmarks server.sdk_overload [--sdk python js cpp] [--rounds 1] [--real] [--most N] [--obey]
 
-The server is emulated: it answers `CAPACITY_PER_S` commands a second, and ends the others as ``busy`` with a
-pause of `MEAN_PAUSE_MS`, spread by half.  Robots send the frames of a camera, newest only, with a deadline of
-250 ms, at twice the capacity in all.  Offered is what arrives after `SETTLED_S`, as a part of the capacity.
-A client in C++ needs its compiler and headers, one in JavaScript Node; what is not there is left out.
+The server is emulated: it answers `CAPACITY_PER_S` commands a second, and refuses the others as ``busy`` with
+a random pause of 0.5 to 1.5 times `MEAN_PAUSE_MS`.  Robots send the frames of a camera, newest only, with a
+deadline of 250 ms, at twice the capacity in all.  The offered load is the rate of commands that arrive after
+`SETTLED_S`, as a share of the capacity.  The C++ client needs a compiler and its headers, the JavaScript
+client needs Node; a client that cannot run is left out.
 
-With ``--real`` it is a server of two workers that solves real PnP (200 matches, 30 % wrong), as in
-``server.capacity``.  ``--most`` is how many robots at 5 frames a second it carries, else they are searched.
-Twice as many robots of the generator in C drive all the time; with ``--obey`` they keep to the pauses
-of refusals.  Beside them drive `ROBOTS` robots of one client, at 5 frames a second, too.  The share of a
-robot is what the server can answer, divided by all robots; what the robots of the client offer is what
-arrives from them after `SETTLED_S`, as a part of `ROBOTS` shares.  A relay between them and the server counts
-it, and costs processor time of the same machine, as the clients do: the server carries less than the most.
+With ``--real`` the server has two workers that solve real PnP (200 matches, 30 % wrong), as in
+``server.capacity``.  ``--most`` is the number of robots at 5 frames a second that the server carries; without
+it, this number is searched.  Twice as many robots of the load generator in C drive all the time; with
+``--obey`` they wait as refusals demand.  Concurrently `ROBOTS` robots of one client drive at 5 frames a
+second. The fair rate of a robot is the capacity divided by all robots.  The offered load is then the rate of
+commands of the client's robots after `SETTLED_S`, as a share of `ROBOTS` fair rates.  A relay before the
+server counts these commands.  Relay and clients use processors of the same machine, so that the server
+carries less than the most robots.
 
-Defends: no client of ours keeps a server in overload, and its statistics say what it held back.
+Defends the promise that clients of our SDKs keep an overloaded server useful: none offers more than its bar,
+and the statistics of each client state the number of commands that the client held back.
 """
 
 from __future__ import annotations
@@ -71,35 +74,38 @@ from rse_pf.wire import (
     make_codec,
 )
 
-CAPACITY_PER_S, ROBOTS, FRAMES_PER_S = 100.0, 20, 10.0
-SETTLED_S, SECONDS = 5.0, 10.0
-MEAN_PAUSE_MS = 1000.0  # as of the server's own rule: some frames of a camera
-BURST_S = 0.1
-DEADLINE_S = 0.25
-TIMES_THE_MOST = 2
-LONGEST_S = 120.0
-STEP_S = 5.0
+CAPACITY_PER_S = 100.0  # commands per second that the emulated server answers
+ROBOTS = 20  # number of robots of one client
+FRAMES_PER_S = 10.0  # frames per second of each robot with the emulated server: twice its capacity in all
+SETTLED_S = 5.0  # time at the begin of a run that is not measured: clients adapt their rate
+SECONDS = 10.0  # duration of a run
+MEAN_PAUSE_MS = 1000.0  # mean pause that a refusal demands, some frames of a camera, as servers demand it
+BURST_S = 0.1  # commands that the emulated server may answer at once, as seconds of its capacity
+DEADLINE_S = 0.25  # deadline of a command
+TIMES_THE_MOST = 2  # robots of the load generator as a multiple of the most that a real server carries
+LONGEST_S = 120.0  # time limit for the robots of the load generator, and for those of a client
+STEP_S = 5.0  # duration of a step of the search of the most robots
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 SDKS = ("python", "js", "cpp")
-COMPILE_S = 300.0
+COMPILE_S = 300.0  # time limit for compiling the C++ client
 
 
 @dataclass(slots=True)
 class Counted:
-    """When each command of the robots came, and when each answered one was answered; monotonic seconds."""
+    """The arrival times of all commands, and the times of all answers; monotonic seconds."""
 
     came_s: list[float] = field(default_factory=list)
     answered_s: list[float] = field(default_factory=list)
 
     def per_s(self, times_s: list[float], first_s: float, last_s: float) -> float:
-        """Return how many of *times_s* a second lie between two times after the first command."""
+        """Return the rate of *times_s* per second between two times, in seconds after the first command."""
         return sum(first_s <= at - self.came_s[0] < last_s for at in times_s) / (last_s - first_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """What the robots of one client send, *frames_per_s* each, and their part of the capacity."""
+    """The commands of the robots of one client, *frames_per_s* by each, and the fair rate of each robot."""
 
     service: str
     payload: Any
@@ -108,7 +114,7 @@ class Drive:
 
 
 class SmallServer(Counted):
-    """Answers as many commands as it can."""
+    """An emulated server that answers `CAPACITY_PER_S` commands a second and refuses the others as busy."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +122,7 @@ class SmallServer(Counted):
         self._random = random.Random(1)
 
     async def talk(self, connection: ServerConnection) -> None:
-        """Serve one robot."""
+        """Serve the robot of one connection until it closes."""
         codec = codec_of(connection)
         try:
             async for data in connection:
@@ -147,14 +153,14 @@ class SmallServer(Counted):
 
 
 class Relay(Counted):
-    """Passes messages between robots and the server at *port*."""
+    """Pass messages between robots and the server at *port*, and count commands and answers."""
 
     def __init__(self, port: int) -> None:
         super().__init__()
         self._port = port
 
     async def talk(self, connection: ServerConnection) -> None:
-        """Serve one robot."""
+        """Serve the robot of one connection until it closes."""
         codec, names = codec_of(connection), [str(connection.subprotocol)]
         url = f"ws://127.0.0.1:{self._port}/ws"
 
@@ -180,7 +186,7 @@ class Relay(Counted):
 
 
 def codec_of(connection: ServerConnection) -> Any:
-    """Return the codec that a robot chose."""
+    """Return the codec that the robot of *connection* chose."""
     return make_codec({name: short for short, name in SUBPROTOCOLS.items()}[str(connection.subprotocol)])
 
 
@@ -214,10 +220,10 @@ async def other_robots(program: list[str], url: str, drive: Drive) -> list[dict[
 
 
 def program_of(sdk: str, folder: Path) -> list[str] | None:
-    """Return the command of the robots of *sdk*, None where it cannot run here."""
+    """Return the command line of the robots of *sdk*; None if this client cannot run on this machine."""
     if sdk == "js":
-        beside = Path(sys.executable).with_name("node")
-        node = str(beside) if beside.exists() else shutil.which("node")
+        own_node = Path(sys.executable).with_name("node")
+        node = str(own_node) if own_node.exists() else shutil.which("node")
         return None if node is None else [node, str(HERE / "sdk_robots.mjs")]
     made = folder / "sdk_robots"
     compiler = shutil.which("c++")
@@ -230,7 +236,7 @@ def program_of(sdk: str, folder: Path) -> list[str] | None:
 
 
 async def run_sdk(program: list[str] | None, peer: SmallServer | Relay, drive: Drive) -> dict[str, Any]:
-    """Return what one client offered to *peer*; *program* None is the Python SDK, in this process."""
+    """Return the load that one client offered to *peer*; *program* None is the Python SDK in this process."""
     names: Any = list(SUBPROTOCOLS.values())
     async with serve(peer.talk, "127.0.0.1", 0, subprotocols=names, compression=None) as server:
         url = f"ws://127.0.0.1:{next(iter(server.sockets)).getsockname()[1]}/ws"
@@ -247,13 +253,13 @@ async def run_sdk(program: list[str] | None, peer: SmallServer | Relay, drive: D
 
 
 def run_emulated(program: list[str] | None) -> dict[str, Any]:
-    """Return what one client offers to the emulated server."""
+    """Return the load that one client offers to the emulated server."""
     drive = Drive(service="echo", payload={"value": 1}, frames_per_s=FRAMES_PER_S, share_per_s=CAPACITY_PER_S)
     return asyncio.run(run_sdk(program, SmallServer(), drive))
 
 
 def run_real(program: list[str] | None, port: int, most: int, obeys: bool) -> dict[str, Any]:
-    """Return what one client offers to the server at *port* that twice its *most* robots use."""
+    """Return the load that one client offers to the server at *port*, with twice the *most* robots."""
     crowd = TIMES_THE_MOST * most
     scenario = LoadScenario(codec="bin", deadline_s=DEADLINE_S, keep=False)
     as_json = make_payloads(replace(scenario, codec="json"), SessionSettings())[0].payload
@@ -295,11 +301,11 @@ def run_benchmark(
 ) -> dict[str, Any]:
     """Let the robots of each client use the server, one client after the other."""
     if unknown := set(sdk) - set(SDKS):
-        raise UsageError(f"no client named {sorted(unknown)[0]}", hint=f"choose of {', '.join(SDKS)}")
+        raise UsageError(f"no client named {sorted(unknown)[0]}", hint=f"name some of {', '.join(SDKS)}")
     if not real and (most or obey):
-        raise UsageError("the emulated server has no crowd for --most or --obey", hint="add --real")
+        raise UsageError("--most and --obey need the robots of a real server", hint="add --real")
     if most < 0:
-        raise UsageError(f"--most {most} is less than nothing", hint="name a number of robots, or 0")
+        raise UsageError(f"--most {most} is below 0", hint="name a number of robots, or 0")
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as opened:
         made = opened.enter_context(tempfile.TemporaryDirectory())

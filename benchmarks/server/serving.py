@@ -32,10 +32,10 @@ UNLIMITED: dict[str, dict[str, Any]] = {
     },
     "session": {"max_commands_per_s": 0.0},
 }  # fmt: skip
-"""Settings for a benchmark that stands for many machines, without tokens, and sends faster than a robot."""
+"""Settings without rate limits and tokens, for a benchmark that sends as many robots from one machine."""
 
-_START_S = 30.0
-_KEY_BYTES = 32
+_START_S = 30.0  # time limit for the start of the server
+_KEY_BYTES = 32  # size of the seed of the signing key
 
 
 def tree(pid: int) -> list[int]:
@@ -45,7 +45,7 @@ def tree(pid: int) -> list[int]:
         try:
             tasks = list(Path(f"/proc/{member}/task").iterdir())
             family += [int(child) for task in tasks for child in (task / "children").read_text().split()]
-        except OSError:  # it ended meanwhile
+        except OSError:  # the process ended after it was listed
             continue
     return family
 
@@ -58,12 +58,13 @@ def cpu_of_tree_s(pid: int) -> float:
             fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
-        ticks += sum(map(int, fields[11:15]))  # its own, and of children that ended and were waited for
+        # Fields 11 and 12 are of the process itself, 13 and 14 of its children that have exited.
+        ticks += sum(map(int, fields[11:15]))
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def private_bytes_of_tree(pid: int) -> int:
-    """Return the memory that only one of *pid* and its descendants uses."""
+    """Return the bytes of private memory of *pid* and its descendants: pages that one process alone uses."""
     kilobytes = 0
     for child in tree(pid):
         try:
@@ -86,10 +87,10 @@ def resident_mib(pids: Sequence[int]) -> float:
 
 
 class BenchServer:
-    """``with BenchServer(folder, workers=2) as server``: a server of its own, ended with the block.
+    """A server for one benchmark: ``with BenchServer(folder, workers=2) as server`` starts and stops it.
 
-    *groups* are settings beside the defaults, such as ``session={"max_in_flight": 4}``; `UNLIMITED` is a set
-    of them.  With ``auth.required``, `token` returns tokens that the server accepts.
+    *groups* are settings that replace the defaults, such as ``session={"max_in_flight": 4}``; `UNLIMITED` is
+    an example.  With ``auth.required``, `token` returns tokens that the server accepts.
     """
 
     def __init__(self, folder: Path, *, workers: int, **groups: dict[str, Any]) -> None:
@@ -126,7 +127,7 @@ class BenchServer:
                     f"the server did not start within {_START_S:g} s",
                     hint=self.log_file.read_text(encoding="utf-8", errors="replace")[-500:],
                 )
-            time.sleep(0.02)  # looks again, with a deadline
+            time.sleep(0.02)  # polls until the deadline
         announced = json.loads(announce.read_text(encoding="utf-8"))
         self.port, self.control_port = announced["port"], announced["control_port"]
         self.pid = self._process.pid
@@ -144,11 +145,11 @@ class BenchServer:
 
     @property
     def log_file(self) -> Path:
-        """Where the server's log is."""
+        """The path of the server's log."""
         return self._folder / "server.log"
 
     def token(self, robot: str, tenant: str = "default") -> str:
-        """Return a new token of *robot*."""
+        """Return a new token for *robot* of *tenant*."""
         self._issued += 1
         identity = f"t-{self._issued}"
         return self._key.issue(
