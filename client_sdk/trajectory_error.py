@@ -155,7 +155,7 @@ def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.boo
 def _motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:
     """Return the errors (metres, degrees) of the motion from each pose to the pose `STEP_S` later.
 
-    Poses without another one at that time, within half the median interval, have no error in the arrays.
+    A pose without another pose at that time, within half the median interval, has no error in the arrays.
     """
     errors = []
     half_s = 0.5 * float(np.median(np.diff(stamps_s)))

@@ -1,4 +1,4 @@
-"""Merges of maps that are too large for one process: they are cut into parts, computed by several processes.
+"""Merge maps that are too large for one process: several processes compute the parts of a merge.
 
 The name of a part is a hash of its inputs and arguments, and its result is stored under this name.  Every
 process computes the same result for a part, and a part whose result is stored is never computed again, also

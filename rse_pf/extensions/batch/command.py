@@ -29,7 +29,7 @@ from rse_pf.terminal import counted, show
 
 __all__ = ["ACTION"]
 
-# Default of --workers: so few worker processes that a laptop can still be used.
+# Default of --workers: a number of worker processes with which a laptop can still be used.
 _WORKERS = 2
 # Largest --workers: a worker takes about 200 MB of memory, so that a larger number is a mistake.
 _MAX_WORKERS = 64

@@ -63,14 +63,14 @@ _DASK = {
     "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "100",
     "DASK_LOGGING__DISTRIBUTED": "critical",
 }
-# Largest number of workers that are replaced in a run; with more, the machine cannot run them, and the run
-# fails.
+# Largest number of workers that are replaced in a run.  If more exit, the machine cannot run the workers, and
+# the run fails.
 _MAX_WORKER_STARTS = 20
 
 
 @dataclass(frozen=True, slots=True)
 class ClusterKey:
-    """Certificate and key (PEM) of one cluster; every process that has them may run code in the cluster."""
+    """Certificate and key (PEM) of one cluster; a process that has both may run code in the cluster."""
 
     certificate: str
     key: str
@@ -129,7 +129,7 @@ class RemoteCluster:
         """Check that the scheduler answers, has a worker, and runs this version of rse-pf.
 
         Raises:
-            Disconnected: It does not answer within 10 s, or has no worker after another 10 s.
+            Disconnected: The scheduler does not answer within 10 s, or has no worker after another 10 s.
             ConfigurationError: A certificate is missing, or a process has another version of rse-pf.
         """
         from distributed import Client

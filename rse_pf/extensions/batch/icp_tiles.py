@@ -31,7 +31,7 @@ TILE_M = 3.0
 """Side of a tile, in metres."""
 # Largest number of tiles of two maps that are aligned: those with the most points.
 _MAX_TILES = 6
-# Smallest number of points that each of the two clouds must have in a tile.
+# Smallest number of points of each of the two clouds in a tile that is aligned.
 _MIN_POINTS = 2000
 
 
@@ -99,6 +99,6 @@ def _within(cloud: Array, low: Array, size_m: float) -> Mask:
 
 
 def _observer(atlas: Atlas, rows: Rows, point: Array) -> int:
-    """Return which of *rows* is the keyframe that observed *point* ``(3,)`` best."""
+    """Return the row, among the keyframes *rows*, of the keyframe that observed *point* ``(3,)`` best."""
     place = find_observers(point[None], [atlas.keyframes[row] for row in rows.tolist()])[0]
     return int(rows[place])

@@ -13,10 +13,11 @@ from rse_pf.http.unauthenticated import SilentConnections
 
 __all__ = ["bound_handshakes", "without_pages"]
 
-# Largest number of connections of a listener whose handshakes are not finished; above it, the oldest
-# is closed.
+# Largest number of connections of a listener with unfinished handshakes; above it, the oldest of these
+# connections is closed.
 _MAX_SILENT = 128
-# Largest number of such connections from one address; above it, the oldest one from this address is closed.
+# Largest number of connections with unfinished handshakes from one address; above it, the oldest one is
+# closed.
 _MAX_PER_SOURCE = 64
 
 

@@ -40,7 +40,7 @@ _SHARES = {
     "vectors": 0.0, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
     "cloud": 0.95,
 }  # fmt: skip
-# Each kind of part in the text of the progress.
+# Name of each kind of part in the text of the progress.
 _DOING = {
     "vectors": "views of maps", "pairs": "proposals", "links": "parts of links",
     "agree": "pairs of maps", "tiles": "pairs of clouds", "cloud": "clouds",
@@ -51,7 +51,8 @@ MAX_KEYFRAMES = 20_000
 """Largest number of keyframes of all maps of one merge, as many as the largest stored map holds."""
 MAX_LINKS_PER_PAIR = 300
 """Largest number of loop closures of two maps, or of one map, that are checked for pairwise consistency.
-The best of each keyframe are taken first.  The time grows with the cube of the number: 215 take 0.4 s."""
+The best loop closures of each keyframe are taken first.  The time grows with the cube of the number: 215
+take 0.4 s."""
 MAX_LINKS = 30_000
 """Largest number of loop closures in a merged map.
 
@@ -320,10 +321,10 @@ class BatchMerge:
 def strongest(
     atlas: Atlas, links: Sequence[LoopClosure], most: int
 ) -> tuple[list[LoopClosure], RejectionCounts]:
-    """Return about *most* of *links* at most, in their order, and counts of the dropped ones by pair of maps.
+    """Return about *most* of the loop closures *links*, in their order, and dropped ones by pair of maps.
 
-    Each pair of maps keeps the same number of links, at least one, or all if it has fewer, so that no map
-    loses its connection.  Of a pair, the best links of each keyframe are kept first.
+    Each pair of maps keeps the same number of loop closures, at least one, or all if the pair has fewer, so
+    that no map loses its connection.  Of a pair, the best loop closures of each keyframe are kept first.
     """
     refused: RejectionCounts = Counter()
     if len(links) <= most:
@@ -341,7 +342,7 @@ def strongest(
 
 
 def _moved(link: LoopClosure, pair: tuple[int, int], starts: npt.NDArray[np.int64]) -> LoopClosure:
-    """Return *link*, whose rows are those of the atlas of *pair* only, with rows of the atlas of all maps.
+    """Convert the keyframe rows of the loop closure *link* from the atlas of *pair* to the atlas of all maps.
 
     *starts* holds the first row of each map in the atlas of all maps, and the number of rows at the end.
     """

@@ -82,10 +82,10 @@ def links_of(result: PartResult) -> list[LoopClosure]:
 
 
 def strongest_rows(links: Sequence[LoopClosure], most: int) -> list[int]:
-    """Return the row numbers of at most *most* of *links*, sorted.
+    """Return the row numbers of at most *most* of the loop closures *links*, sorted.
 
-    The link with the most inliers of each keyframe comes before every keyframe's second best, so that the
-    chosen links are spread over the map.
+    The loop closure with the most inliers of each keyframe comes before every keyframe's second best, so that
+    the chosen loop closures are spread over the map.
     """
     by_inliers = sorted(range(len(links)), key=lambda row: (-links[row].inliers, row))
     seen: Counter[int] = Counter()
@@ -129,7 +129,7 @@ def _links(store: ObjectStore, part: Part) -> PartResult:
 def _agree(store: ObjectStore, part: Part) -> PartResult:
     """Select the pairwise consistent loop closures between two maps, or within one.
 
-    The array ``rows`` has the row numbers of the accepted ones; rejected ones are counted by reason.
+    The array ``rows`` has the row numbers of the accepted loop closures; rejected ones are counted by reason.
     """
     maps = part.arguments["maps"]
     atlas = _atlas(store, part, maps)

@@ -45,7 +45,7 @@ Array = npt.NDArray[Any]
 
 
 class Part(msgspec.Struct, frozen=True, kw_only=True):
-    """One unit of work: the kind of its computation (a key of `tasks._KINDS`), inputs and arguments."""
+    """One unit of work: the kind of its computation (a key of `part_kinds._KINDS`), inputs and arguments."""
 
     kind: str
     inputs: tuple[str, ...]

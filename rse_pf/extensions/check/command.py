@@ -2,7 +2,8 @@
 
 SOURCE is a recording, a ROS bag, a folder of images, a video, a device, or the results of a map that was
 checked while it was made.  All frames are tracked on this machine, without a platform.  The worst findings
-come first; what this drive cannot show is listed with the reason.  The exit code is 1 if something is wrong.
+come first; faults that this drive does not determine are listed with the reason.  The exit code is 1 if
+something is wrong.
 
 examples:
   rse-pf check recordings/kitchen
@@ -73,8 +74,9 @@ class CheckDriveRequest(SensorRequest, AcceptRequest):
 def check_drive(request: CheckDriveRequest, settings: PlatformSettings) -> int:
     """Run ``rse-pf check``; return the exit code.
 
-    It is 1 if there is a finding, a doubt about the source that the user has not accepted, or no frame with a
-    pose; else 0.  For a folder with the results of a map, the findings in its report.json are shown.
+    The exit code is 1 if there is a finding, a doubt about the source that the user has not accepted, or no
+    frame with a pose; else 0.  For a folder with the results of a map, the findings in its report.json are
+    shown.
     """
     if request.frames is not None and request.frames < 2:
         raise UsageError(f"--frames {request.frames} is below 2", hint="leave it out to look at all frames")
@@ -219,7 +221,7 @@ def _watched(
     has_depth: bool,
     most: int | None,
 ) -> CheckReport:
-    """Track the frames in this process, at most *most* of them (None for all), and return their check.
+    """Track at most *most* frames (None for all) in this process, and return the result of their check.
 
     If the source fails after its first frame, the frames before are checked.  *accepted* are the names of the
     doubts that the user has accepted.
@@ -267,7 +269,7 @@ def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:
 def _base(request: CheckDriveRequest, seen: Intrinsics) -> Intrinsics:
     """Return the intrinsics to correct: those of ``--intrinsics``, else of the folder's file, else *seen*.
 
-    A file of a rig is not corrected; *seen* is returned then, too.
+    The file of a rig is not corrected: *seen* is returned instead.
     """
     from client_sdk.rigs.intrinsics import Intrinsics
     from client_sdk.rigs.rig_file import read_calibration

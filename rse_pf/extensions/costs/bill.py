@@ -1,8 +1,8 @@
 """Estimate the monthly costs of a deployment: line by line, by component of the architecture (Fig. 2 of the
 paper), and for the Lambda function alone.
 
-A server is used up to a CPU load of ``scaling.busy_cpu_percent``; the fleet has as many servers as the
-commands need then, but at least ``scaling.min_servers``.  Each line is rounded to a cent before lines are
+Servers are loaded up to a CPU load of ``scaling.busy_cpu_percent``; the fleet has the number of servers that
+the commands then need, and at least ``scaling.min_servers``.  Each line is rounded to a cent before lines are
 added. `NOT_INCLUDED` lists the costs that the estimate leaves out.
 """
 
@@ -67,7 +67,7 @@ _DETAILED_METRICS = 7
 _READ_METRICS = 2
 # Number of rules of the web ACL in addition to the rate limits: one refuses burst commands without a token.
 _TOKEN_RULES = 1
-# AWS has a higher price for alarms with a period below this one, in seconds.
+# Period, in seconds, below which AWS has a higher price for alarms.
 _FAST_BELOW_S = 60
 # Assumed duration of one call of the canary, seconds.
 _CANARY_S = 1.0
@@ -180,7 +180,7 @@ def lambda_executions(prices: Prices, load: Load) -> float:
 def servers_needed(settings: PlatformSettings, prices: Prices, load: Load) -> int:
     """Return the number of servers of the fleet while the robots work.
 
-    That is the largest number of ``scaling.min_servers``, the servers for the commands, and the servers for
+    The result is the largest of ``scaling.min_servers``, the servers for the commands, and the servers for
     the connections of the robots (``serving.max_robots``).
     """
     vcpus = prices.server(settings.cloud.instance_type).vcpus

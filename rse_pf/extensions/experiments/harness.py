@@ -40,7 +40,7 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]
 
-# Events after which `Harness.wait_quiet` waits again.
+# Events of the platform after which `Harness.wait_quiet` begins its wait again.
 _SERVER_CHANGES = {
     "grow", "shrink", "replace", "server-launched", "server-healthy", "server-gone", "phase",
 }  # fmt: skip
@@ -153,7 +153,7 @@ class Harness:
         )
 
     async def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until *condition* returns True; return False if it did not within *timeout_s*.
+        """Wait until *condition* returns True; return False if that did not happen within *timeout_s*.
 
         *condition* is called after each event and sample, and at least once a second.
         """

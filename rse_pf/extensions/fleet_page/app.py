@@ -47,7 +47,7 @@ _LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 # Topics of the stream, besides "live/MAP".
 _TOPICS = frozenset(("fleet", "history", "robots", "event", "audit", "pose", "link", "maps"))
 _LIVE = "live/"
-# HTTP status of an error by its code; 400 for all others.
+# HTTP status of an answer by the code of its error; other codes have the status 400.
 _STATUS = {
     Unauthorized.code: 401,
     Forbidden.code: 403,
@@ -88,7 +88,7 @@ class PageAccess:
 
     Attributes:
         sessions: The sessions and keys of users who may view or operate.
-        admin_token: Returns the token of the control ports; who sends it may request new keys.
+        admin_token: Returns the token of the control ports; a request with this token may ask for new keys.
     """
 
     sessions: PageSessions
@@ -235,7 +235,7 @@ async def _body(receive: Receive) -> dict[str, Any]:
     while True:
         part = await receive()
         if part["type"] != "http.request":
-            raise BadRequest("the browser left", hint="try again")
+            raise BadRequest("the browser disconnected before its request was complete", hint="try again")
         data += part.get("body", b"")
         if len(data) > _MAX_BODY_BYTES:
             raise LimitExceeded(f"a request has more than {_MAX_BODY_BYTES} bytes", hint="send less")
@@ -246,7 +246,7 @@ async def _body(receive: Receive) -> dict[str, Any]:
     except (ValueError, RecursionError):
         body = None
     if not isinstance(body, dict):
-        raise BadRequest("the body is no JSON object", hint="send one")
+        raise BadRequest("the body of the request is no JSON object", hint="send a JSON object")
     return body
 
 

@@ -83,7 +83,7 @@ class MapPages:
         return "application/octet-stream", await asyncio.to_thread(self._cloud, query)
 
     async def _prepare(self, query: Mapping[str, str]) -> None:
-        with suppress(RsePfError, OSError):  # the page gets the error when it requests this cloud
+        with suppress(RsePfError, OSError):  # the page receives the error when it requests this cloud
             await asyncio.to_thread(self._cloud, query)
 
     def close(self) -> None:

@@ -26,7 +26,9 @@ MAX_SESSIONS = 32
 _MAX_KEYS = 64
 # A session that was not used for this long ends, in seconds.
 _IDLE_S = 12 * 3600.0
+# Hint of errors about keys and sessions of users.
 _NEW_KEY = "get a new address with: rse-pf fleet"
+# Hint of errors about keys of operators.
 _NEW_OPERATOR_KEY = "get one with: rse-pf fleet --operate"
 
 
@@ -80,7 +82,7 @@ class PageSessions:
         if role is None:
             raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_OPERATOR_KEY)
         if role != "operate":
-            raise Forbidden("this key is for looking only", hint=_NEW_OPERATOR_KEY)
+            raise Forbidden("this key allows to view the page only", hint=_NEW_OPERATOR_KEY)
         self._sessions[_digest(session)].role = "operate"
 
     def role_of(self, session: str, *, now_s: float) -> Role:

@@ -29,7 +29,8 @@ _NEXT_KEYFRAMES = 3
 _OUTLIER_PX = 4.0
 """Largest reprojection error in pixels of a match and of an observation, and the width of the Huber loss of
 the triangulation; COLMAP filters its own models by the same limit."""
-_ROUNDS = 4  # rounds of each triangulation: one by measured points alone, and three with pixels
+# Iterations of each triangulation: one with measured points alone, then three with pixels as well.
+_ROUNDS = 4
 _OUTLIER_ROUNDS = 2
 """Number of rounds, each of which triangulates the points and then removes outliers; one more triangulation
 follows the last round."""
@@ -39,7 +40,7 @@ _MIN_DEPTH_M = 0.05
 frame of a camera counts as behind it."""
 _MAX_DEPTH_M = 200.0  # largest depth in metres at which a feature's measured point is used
 _DEPTH_NOISE = DepthNoise()  # noise by which measured depths are weighted: the default, that of a Kinect
-_GREY = 128  # red, green and blue of a point without a coloured point of the cloud nearby
+_GREY = 128  # red, green and blue of a point without a point of the coloured cloud in its voxel
 _COLOUR_VOXEL_M = 0.05  # edge in metres of the voxels in which a point takes the colour of the cloud
 
 
@@ -124,8 +125,8 @@ def distinct_cameras(version: MapVersion) -> list[Camera]:
 def _keyframe_pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
     """Yield pairs of indices of keyframes that are matched, each pair once.
 
-    They are each keyframe with the three that follow it in time among those of its robot, and the keyframes
-    that an edge connects.
+    A keyframe is matched with the three keyframes of its robot that follow it in time, and with the keyframes
+    to which an edge connects it.
     """
     pairs: dict[tuple[int, int], None] = {}
     by_robot: dict[str, list[int]] = {}

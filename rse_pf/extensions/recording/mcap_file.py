@@ -18,14 +18,14 @@ from typing import Any
 
 __all__ = ["MAX_CHUNK_BYTES", "MAX_CHUNK_NS", "McapFile"]
 
-MAX_CHUNK_BYTES = 1 << 20  # size at which a chunk is written
-MAX_CHUNK_NS = 500_000_000  # age of its first message, ns, at which a chunk is written
+MAX_CHUNK_BYTES = 1 << 20  # size in bytes at which a chunk is written to the file
+MAX_CHUNK_NS = 500_000_000  # age, ns, of the first message of a chunk at which the chunk is written
 _MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 # A message record: opcode, length, channel, sequence number, log time and publish time (ns); the data
 # follows.
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_BYTES = _MESSAGE.size
-_MESSAGE_FIELDS = _MESSAGE_BYTES - 9  # bytes of its fields without opcode (1) and length (8)
+_MESSAGE_FIELDS = _MESSAGE_BYTES - 9  # size of the fields of a chunk record without opcode (1) and length (8)
 _pack_message = _MESSAGE.pack
 # A chunk record: opcode, length, first and last time (ns), uncompressed size, CRC, length of the name of the
 # compression, size of the records that follow.  Chunks are not compressed: the name is empty, its length 0.
@@ -40,7 +40,10 @@ _CHUNK_INDEX = struct.Struct("<BQQQQQI")
 # name of the compression (0, so that no name follows), compressed and uncompressed size (the same).
 _CHUNK_INDEX_END = struct.Struct("<QIQQ")
 _OFFSET = struct.Struct("<HQ")  # one message index offset: channel, offset of the index in the file
-_OP_MESSAGE, _OP_CHUNK, _OP_INDEX, _OP_CHUNK_INDEX = 5, 6, 7, 8  # opcodes of the MCAP specification
+_OP_MESSAGE = 5  # opcode of a message record in the MCAP specification
+_OP_CHUNK = 6  # opcode of a chunk record
+_OP_INDEX = 7  # opcode of a message index record
+_OP_CHUNK_INDEX = 8  # opcode of a chunk index record
 
 
 class McapFile:

@@ -25,7 +25,8 @@ _NS = 1_000_000_000  # nanoseconds of a second
 _POINT_BYTES = 12  # bytes of a point: x, y and z as float32
 # Format of `struct` for the numbers of a MessagePack extension of the codec ``bin``, by its type.
 _NUMBERS = {1: "f", 3: "d"}
-_NUMBER_BYTES = {1: 4, 3: 8}  # bytes of such a number, by type
+# Size in bytes of a number of a MessagePack extension of ``bin``, by type of the extension.
+_NUMBER_BYTES = {1: 4, 3: 8}
 
 
 class _Pose(msgspec.Struct, frozen=True):

@@ -214,7 +214,7 @@ class WireRecording:
     def find(self, identity: str) -> RecordedCommand:
         """Return the command with the id *identity*.
 
-        That is ``CONNECTION:ID``, or ``ID`` alone if only one connection has a command with this id.
+        *identity* is ``CONNECTION:ID``, or ``ID`` alone if only one connection has a command with this id.
 
         Raises:
             BadRequest: No command, or more than one, has this id.
@@ -374,8 +374,8 @@ def recording_files(path: Path) -> tuple[Path, ...]:
 class _ChannelMessage(NamedTuple):
     """One message of a file.
 
-    ``of`` says whose it is: a connection, or a pair of ``frames`` (thumbnail) or ``odometry`` and the
-    pseudonym of the robot.  ``time_ns`` is the Unix time, ``about`` the metadata of the file.
+    ``of`` is the source of the message: a connection, or a pair of ``frames`` (thumbnail) or ``odometry`` and
+    the pseudonym of the robot.  ``time_ns`` is the Unix time, ``about`` the metadata of the file.
     """
 
     of: file_format.WireChannel | tuple[str, str]
@@ -396,8 +396,8 @@ class _RobotImages:
     def of(self, kind: str, command: RecordedCommand) -> bytes | None:
         """Return the JSON of the thumbnail (*kind* ``frames``) or the odometry (``odometry``) of *command*.
 
-        That is the one which names the command, else the newest of the last 0.5 s before it; None without
-        one.
+        The result is the entry that names the command, or else the newest entry of the last 0.5 s before the
+        command; None without such an entry.
         """
         images = self._kept.get(kind, ())
         mark = f'"command":"{command.id}"'.encode()

@@ -44,7 +44,8 @@ PROTOCOL_WORDS = frozenset({
     "rmse_px", "covariance", "verdict", "reason", "engine", "native", "opencv", "ok", "weak",
     "target", "source", "T_target_source", "overlap", "iterations",
 })  # fmt: skip
-"""Words of requests and replies that are not replaced there, even if a robot has one of them as its name."""
+"""Words of requests and replies that are never replaced in `_VALUE_FIELDS`, even if a robot has such a
+name."""
 _TOKEN_START = b"eyJ"  # the first bytes of every JSON Web Token
 _TOKEN = re.compile(rb"eyJ[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}")
 """Pattern of a JSON Web Token; a message that contains one is left out."""

@@ -47,7 +47,7 @@ _MAX_AUTH_BYTES = 8192
 _MAX_WITHOUT_TOKEN = 10
 # Pause before a client with a rejected token is closed, in seconds, so that an address can try few tokens.
 _REFUSED_S = 1.0
-# Time after which a client with too many unanswered calls may try again, in ms; it is part of the error.
+# Time, in ms, after which a client with too many unanswered calls may try again; stated in the error.
 _BUSY_MS = 200.0
 # Levels of ``set_level`` with which a client receives status messages about errors.
 _ERROR_LEVELS = ("error", "warning", "info")

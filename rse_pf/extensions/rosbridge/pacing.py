@@ -2,10 +2,10 @@
 
 A client answers a ping after it has read everything before the ping, so that the pong acknowledges all
 earlier messages, also those in buffers of kernels and proxies.  To a client that answers in time, messages
-are sent without waiting, with at most one ping on its way.  To a client that does not, and to a new client,
-each message is sent only after a pong and a pause.  The pause grows with each late pong and shrinks with each
-prompt one, so that the rate approaches the rate at which the client reads.  The class is given all times, and
-uses no socket and no clock.
+are sent without waiting, with at most one ping on its way.  To a client that answers late, and to a new
+client, each message is sent only after a pong and a pause.  The pause grows with each late pong and shrinks
+with each prompt one, so that the rate approaches the rate at which the client reads.  The class is given all
+times, and uses no socket and no clock.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 __all__ = ["Pacing"]
 
 FIRST_PAUSE_S = 0.02  # pause (s) between messages to a new client; it is over after seven prompt pongs
-NO_PAUSE_S = 0.005  # a pause that has shrunk below this (s) ends: messages are sent without waiting
+NO_PAUSE_S = 0.005  # a pause that has shrunk below this time (s) becomes 0: messages are sent without waiting
 SHRINKING = 0.8  # factor of the pause after each prompt pong: a pause of 0.5 s is over after about 2 s
 LATE_SHARE = 0.5  # the pause becomes at least this fraction of a late pong's delay, in which the client reads
 # A pong is late if it takes longer than this time (s) plus twice the shortest round trip.

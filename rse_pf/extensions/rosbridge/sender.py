@@ -62,7 +62,8 @@ class TopicSender:
             while True:
                 await self._next_due()
                 await self._pace()
-                subscription = await self._next_due()  # chosen again: the first may be gone after the pong
+                # Chosen again: the subscription that was chosen before the pong may have ended.
+                subscription = await self._next_due()
                 del self._due[subscription]
                 message = subscription.take(self._clock())
                 if subscription:

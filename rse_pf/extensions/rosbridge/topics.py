@@ -196,7 +196,7 @@ class Topics:
         return topic
 
     def _settle(self, topic: _Topic, client: TopicClient) -> None:
-        """Remove *topic* from the topics of *client* if it no longer uses it; delete a topic nobody uses."""
+        """Remove *topic* from the topics of *client* if it is unused there; delete a topic nobody uses."""
         if client in topic.publishers or client in topic.subscriptions:
             return
         own = self._of_client.get(client, {})

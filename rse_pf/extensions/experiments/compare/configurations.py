@@ -33,10 +33,10 @@ BUILT_IN = {
     "features-N": "with N features in each frame, such as features-500",
     "MODULE:FUNCTION": "with features of your own, as for rse-pf demo --features",
 }
-"""The built-in configurations: name, and one line of help."""
+"""The built-in configurations of the tracker: name, and one line of help."""
 SLOTS = ("features", "motion", "loops", "optimiser")
 """Functions that a Python file may set; each is the argument of `Mapper` of the same name."""
-# Options that a file may set.
+# Names of the options that the file of a configuration may set.
 _OPTIONS = ("base", "depth", "frontend", "monocular")
 _FEATURES = re.compile(r"features-(\d{1,6})")
 # Smallest N of ``features-N``.

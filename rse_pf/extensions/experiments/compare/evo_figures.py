@@ -21,8 +21,8 @@ _COMMAND = "evo_ape"
 _RMSE = re.compile(r"^\s*rmse\s+([0-9.eE+-]+)\s*$", re.MULTILINE)
 # Time limit of one run of evo, in seconds.
 _WAIT_S = 60.0
-# Largest difference of two time stamps that evo takes for the same, in seconds: we write the same stamps in
-# both files.
+# Largest difference, in seconds, of two time stamps that evo takes for equal; both files that we write have
+# equal stamps.
 _SAME_S = "0.001"
 
 

@@ -16,9 +16,9 @@ from rse_pf.errors import UsageError
 __all__ = ["Drive", "drives_of", "open_recording"]
 
 _WORLD = re.compile(r"world:(\d{1,9})")
-# Frames of a rendered world.
+# Number of frames of a rendered world.
 _WORLD_FRAMES = 80
-# A requested rate of more than this many times that of the recording is reported as too high.
+# Ratio of a requested rate to that of the recording above which the rate is reported as too high.
 _ABOVE = 1.05
 
 
@@ -48,8 +48,8 @@ def drives_of(
 ) -> list[Drive]:
     """Return each of the recordings *words* at each of *rates_hz*.
 
-    Without rates, at the recording's own rate.  Rates that give the same frames of a recording give one
-    drive.  *camera* and *imu* are those of `open_dataset`.
+    Without rates, each recording is returned at its own rate.  Rates that give the same frames of a recording
+    give one drive.  *camera* and *imu* are those of `open_dataset`.
 
     Raises:
         UsageError: A recording cannot be read, or two recordings have the same name.

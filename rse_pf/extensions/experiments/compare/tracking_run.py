@@ -25,9 +25,9 @@ __all__ = ["TrackingRun", "longest_gap_s", "score", "track"]
 
 # Name of the robot in the keyframes of a run.
 _ROBOT = "compare"
-# Number of the first segment, the only one whose poses count for the errors of online poses.
+# Number of the first segment; only its poses count for the errors of online poses.
 _FIRST = 0
-# Smallest number of poses for which errors are computed.
+# Smallest number of poses of a run from which errors are computed.
 _FEWEST = 3
 
 

@@ -44,7 +44,7 @@ _FAILING_PERCENT = 30.0
 _EARLIEST = 0.16
 # Latest time of a fault, as a fraction of the drive; a long fault begins in the first half of the interval.
 _LATEST = 0.5
-# A fault that lasts for more than this many seconds is a long one.
+# Duration, in seconds, above which a fault is a long one.
 _LONG_S = 20.0
 # Time between two reads of the map's lease, in seconds.
 _WATCH_S = 0.02
@@ -210,7 +210,7 @@ class Disturbance:
         """Wait until a map server serves the map, and return its lease.
 
         Raises:
-            CommandFailed: There was none within 20 s.
+            CommandFailed: No map server served the map within 20 s.
         """
         for _ in range(round(_OWNER_S / _WATCH_S)):
             if self._lease is not None and self._lease.state == "serving":

@@ -21,9 +21,9 @@ from rse_pf.terminal import counted
 __all__ = ["advice", "closing_lines", "demo_page", "is_lost", "make_report"]
 
 # Fraction of lost frames from which on the demo prints advice.
-_SOME = 0.1
+_ADVICE_FRACTION = 0.1
 # Fraction of frames without a pose above which a run has failed.
-_MOST = 0.5
+_FAILED_FRACTION = 0.5
 
 
 def make_report(
@@ -121,7 +121,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
     out = _relative(folder)
     files = f"{out}/map.png, " if (folder / "map.png").exists() else ""
     third = ""
-    if _without_pose(report) > _MOST * report["frames"]:
+    if _without_pose(report) > _FAILED_FRACTION * report["frames"]:
         third = f"failed: {_without_pose(report)} of {counted(report['frames'], 'frame')} have no pose\n"
         if report["frames_before_start"]:
             third += "a camera without depth begins once it has moved, not only turned, over texture\n"
@@ -147,7 +147,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str
 
 def is_lost(report: Mapping[str, Any]) -> bool:
     """Return whether a command got no final answer, or more than half of the frames got no pose."""
-    return bool(report["commands"]["lost"] > 0 or _without_pose(report) > _MOST * report["frames"])
+    return bool(report["commands"]["lost"] > 0 or _without_pose(report) > _FAILED_FRACTION * report["frames"])
 
 
 def _without_pose(report: Mapping[str, Any]) -> int:
@@ -157,7 +157,7 @@ def _without_pose(report: Mapping[str, Any]) -> int:
 def advice(report: Mapping[str, Any]) -> str:
     """Return a line of advice, with a newline, if at least a tenth of the frames was lost; otherwise ""."""
     asked = report["asked"]
-    if report["lost_frames"] < _SOME * report["frames"] or not report["lost_frames"]:
+    if report["lost_frames"] < _ADVICE_FRACTION * report["frames"] or not report["lost_frames"]:
         return ""
     rate = "" if asked.get("data") is None else f"play more of its frames (--rate above {asked['rate_hz']:g})"
     wide = "match over larger steps (--frontend wide-baseline)" * (asked.get("frontend") != "wide-baseline")

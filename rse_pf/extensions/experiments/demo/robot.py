@@ -47,12 +47,12 @@ __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"
 _ROBOT_NICE = 5
 # Smallest number of measurements of a point that is written to the cloud.
 _MIN_READINGS = 2
-# A robot that may solve poses itself begins this long before the deadline of a command, in seconds; the time
-# is long because all robots and servers share one machine.
+# Time, in seconds, before the deadline of a command at which a robot begins to solve the pose itself; long,
+# because all robots and servers share one machine.
 _OWN_SOLVER_S = 0.2
-# Frames per robot in the rendered world.
+# Number of frames of each robot in the rendered world.
 _DEFAULT_FRAMES = 80
-# Smallest number of frames per robot in the rendered world whose maps are merged.
+# Number of frames of each robot in the rendered world if the maps of the robots are merged.
 _LEAST_MERGE_FRAMES = 150
 
 

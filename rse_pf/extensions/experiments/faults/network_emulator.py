@@ -40,19 +40,19 @@ _MIN_S = 0.001
 _HELD_BYTES = 1 << 20
 # Length of the queue of connections that wait to be accepted.
 _BACKLOG = 1024
-# Connections that the link opens to itself during a cut: they fill the listener's queue of one, with one to
-# spare.
+# Number of connections that the link opens to itself during a cut: one fills the listener's queue of length
+# one, the other is spare.
 _FILLERS = 2
 # Time until TCP on Linux retransmits a lost segment, in seconds; it doubles with each further retransmission.
 _FIRST_RETRY_S = 0.2
-# Time until TCP on Linux retransmits the first segment of a connection (SYN), in seconds; it doubles, too.
+# Time until TCP on Linux retransmits the first segment of a connection (SYN), in seconds; it doubles as well.
 _FIRST_DIAL_RETRY_S = 1.0
 # Longest time between two retransmissions, in seconds.
 _MAX_RETRY_S = 120.0
 # Longest wait for an answer of the process of a link, in seconds; starting the process is the slowest case.
 _START_TIMEOUT_S = 20.0
-# Timers of asyncio fire up to 1 ms late; they are set this much earlier, in seconds, so that the mean error
-# is 0.
+# Time, in seconds, by which timers are set earlier: timers of asyncio fire up to 1 ms late, and the mean
+# error then is 0.
 _TIMER_GRAIN_S = 0.0005
 
 
@@ -106,8 +106,8 @@ def profile_named(name: str) -> LinkProfile:
 def retransmitted_s(sent_s: float, healed_s: float, first_s: float = _FIRST_RETRY_S) -> float:
     """Return the time of the first retransmission at or after *healed_s* of a segment first sent at *sent_s*.
 
-    Retransmissions before *healed_s* are lost.  *first_s* is the time until the first one; all are in
-    seconds.
+    Retransmissions before *healed_s* are lost.  *first_s* is the time until the first retransmission.  All
+    times are in seconds.
 
     Source:
         RFC 6298: the time-out doubles with every retransmission; Linux begins with 0.2 s, or 1 s for a SYN.
@@ -348,7 +348,8 @@ class _Way:
         first = retransmitted_s(self._queue[0][1], healed_s)
         again = self._lane.arrival_s(first, 0)
         self._queue = deque((max(due, again), sent, data) for due, sent, data in self._queue)
-        self._armed_s = None  # a timer that was set before compares its time with this one, and does nothing
+        # A timer that was set earlier compares its time with the new one, and does nothing.
+        self._armed_s = None
         self._arm()
 
     def end(self) -> None:

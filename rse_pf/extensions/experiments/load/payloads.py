@@ -18,12 +18,12 @@ from rse_pf.wire.preencoded import PreencodedCommand, preencode
 
 __all__ = ["SolvedPayload", "is_right", "make_payloads"]
 
-# Number of different payloads that a load repeats: so many that caches of servers do not help.
+# Number of different payloads that a load repeats: enough that caches of servers have no effect.
 _POOL = 64
-# A pose whose camera centre is farther from the truth than this, in metres, is counted as wrong; with 200
-# matches the error is one or two centimetres.
+# Largest distance, in metres, of the camera centre of a correct pose from the truth; with 200 matches the
+# error is one or two centimetres.
 _POSE_M = 0.05
-# A pose whose rotation differs from the truth by more than this, in radians, is counted as wrong.
+# Largest rotation, in radians, of a correct pose relative to the truth.
 _POSE_RAD = math.radians(1.0)
 
 

@@ -59,7 +59,7 @@ class LoadScenario:
     link: str | None = None
 
     def __post_init__(self) -> None:
-        """Check every field."""
+        """Check that every field is in range."""
         _within("robots", self.robots, 1, _MAX_ROBOTS)
         _within("fps", self.fps, 0.01, _MAX_FPS)
         _within("seconds", self.seconds, 0.01, _MAX_S)
@@ -79,7 +79,7 @@ class LoadScenario:
 def read_scenario(file: Path) -> LoadScenario:
     """Read a JSON object whose members are fields of `LoadScenario`.
 
-    Fields that it lacks have their defaults.
+    Fields that the object lacks have their defaults.
 
     Raises:
         UsageError: The file cannot be read, holds something else, or a value is out of range.

@@ -51,7 +51,7 @@ __all__ = ["Swarm", "SwarmResult", "records_of"]
 _READY_TIMEOUT_S = 60.0
 # Longest wait for the answer of a child process to an order, beyond the time that the order itself takes.
 _END_TIMEOUT_S = 30.0
-# The start is planned this far ahead, in seconds, so that every child has received the order before it.
+# Time, in seconds, from the order to start to the planned start, so that every child has the order in time.
 _HEAD_START_S = 0.2
 
 Event = Mapping[str, Any]

@@ -42,9 +42,9 @@ __all__ = [
 
 # Up, queue, compute and down time (ms) in the row of a command without a result: they are not known.
 _NO_PARTS = (math.nan,) * 4
-# Rows of commands that are sent to the parent in one message at most.
+# Largest number of rows of commands that are sent to the parent in one message.
 _ROWS = 256
-# Rows wait for at most this long before they are sent to the parent, in seconds.
+# Longest time, in seconds, that rows of commands wait before they are sent to the parent.
 _FLUSH_EVERY_S = 0.5
 # Pause before a robot whose first connection failed connects again, in seconds.
 _REJOIN_S = 1.0

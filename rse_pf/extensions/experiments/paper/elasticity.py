@@ -70,7 +70,7 @@ _SERVERS_AT_FULL = 5
 _CALIBRATION_S = 4.0
 # Seconds for which the CPU time of a server without commands is measured.
 _CALIBRATION_IDLE_S = 2.0
-# Largest number of robots in that measurement: one server must be able to serve them all.
+# Largest number of robots in the measurement of CPU time: one server must be able to serve them all.
 _CALIBRATION_ROBOTS = 20
 # Shortest time without a change of the servers before the next phase begins, in seconds.
 _MIN_QUIET_S = 6.0
@@ -125,7 +125,7 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
     chosen = settings.replace(
         serving={"emulated_cores": cores},
         local={"servers": settings.scaling.min_servers},
-        scaling={"profile": "paper", "underused_s": 0, "schedule": ""},  # only the rules of the paper
+        scaling={"profile": "paper", "underused_s": 0, "schedule": ""},  # the scaling rules of the paper only
     )
     for part, rebalance in runs.values():
         asyncio.run(_run(options, chosen, part, rebalance))
@@ -285,7 +285,7 @@ def _phase(harness: Harness, name: str) -> None:
 
 # Begin of the scaling policy's reason when it adds servers because some are missing, not because of load.
 _FEWER = "fewer than"
-# Samples in the records are rounded: a mean CPU this much below the limit, in percent, counts as reaching it.
+# Distance below the CPU limit, in percent, at which a mean CPU counts as reaching it: samples are rounded.
 _ROUNDING_PERCENT = 0.01
 
 
@@ -455,7 +455,8 @@ def busy_periods_before(
 def find_unjustified_scale_outs(records: Records) -> list[str]:
     """Return a line for each scale-out for high CPU before which the CPU was not high for long enough.
 
-    Required is a mean CPU of at least the policy's limit in each of the ``busy_periods`` periods before it.
+    A scale-out is justified by a mean CPU of at least the policy's limit in each of the ``busy_periods``
+    periods before it.
     """
     parameters = parameters_of(records)
     wrong = []

@@ -61,11 +61,11 @@ FIGURE = "robustness.png"
 _BEFORE_FAULT_S = 4.0
 # Longest wait until all robots have joined, in seconds.
 _JOIN_TIMEOUT_S = 60.0
-# Link profile of a fault that cuts the link: without delay.
+# Name of the link profile, one without delay, for faults that cut the link.
 _NO_DELAY = "none"
 # Faults of the short run with which ``verify --rerun`` checks this experiment.
 _SHORT_FAULTS = ("kill", "wifi")
-# Robots of that short run.
+# Number of robots of the short run with which ``verify --rerun`` checks this experiment.
 _SHORT_ROBOTS = "20"
 
 
@@ -176,9 +176,9 @@ def _line(name: str, run: Mapping[str, Any]) -> str:
     )
 
 
-# Targets of every scenario.
+# Targets of every scenario: no command is lost or answered twice.
 _NO_LOSS = {"commands/lost": (0, "<="), "commands/twice": (0, "<=")}
-# Targets of scenarios during which no command may fail either.
+# Targets of scenarios during which no command may be lost, answered twice or fail.
 _NO_FAILURE = {**_NO_LOSS, "commands/failed": (0, "<=")}
 
 BARS: dict[str, dict[str, tuple[float, str]]] = {
@@ -279,8 +279,8 @@ def robustness_page(report: Mapping[str, Any]) -> str:
 def time_until_even_s(samples: Sequence[MonitorSample], since_s: float) -> float | None:
     """Return the seconds from *since_s* until the robots were evenly distributed over the healthy servers.
 
-    Even means that the number of each server is within 20 % of the mean, or within one robot, until the end
-    of the samples.  None if that was never reached.
+    Even means that the number of robots of each server is within 20 % of the mean, or within one robot of it,
+    until the end of the samples.  The result is None if that was never reached.
     """
     reached = None
     for sample in samples:

@@ -36,7 +36,7 @@ __all__ = [
 _CLOCK_MS = 0.01
 # The figure that needs the point clouds, which shipped results may lack.
 _CLOUD_FIGURE = "map_points"
-# A value in the output is cut after this many characters.
+# Largest number of characters of a value in the output; longer values are cut.
 _MAX_SHOWN = 60
 # Experiments whose round trips count from the real send time: their robots plan frames, not commands.
 _FRAME_EXPERIMENTS = {"map", "live", "live-fault"}

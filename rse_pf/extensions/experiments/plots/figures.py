@@ -26,9 +26,15 @@ from rse_pf.maps.format import MapVersion
 
 __all__ = ["draw_elasticity", "draw_latency", "draw_live", "draw_robustness", "require_matplotlib"]
 
-_BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#c0392b", "#8a8f98"
+_BLUE = "#1f5fa8"
+_ORANGE = "#d9822b"
+_GREEN = "#3a8f4d"
+_RED = "#c0392b"
+_GREY = "#8a8f98"
+# Colours and names of the parts of a round trip.
 _PARTS_COLOURS = {"up_ms": "#7aa6d6", "queue_ms": _ORANGE, "compute_ms": _GREEN, "down_ms": _BLUE}
 _PARTS_NAMES = {"up_ms": "up", "queue_ms": "queue", "compute_ms": "compute", "down_ms": "down"}
+# Legend of the paper's transmission time, which the paper does not divide into up and down.
 _TRANSMISSION = "transmission, not split"
 # Number of bins of equal width along the time axis over which round trips and failures are aggregated.
 _BINS = 80

@@ -28,15 +28,15 @@ from rse_pf.terminal import printable
 
 __all__ = ["DrawnPath", "Panel", "draw_trajectories", "pieces"]
 
-_WIDTH = 800  # of a panel, in pixels
-_HEIGHT = 640  # of a panel, in pixels
+_WIDTH = 800  # width of a panel, in pixels
+_HEIGHT = 640  # height of a panel, in pixels
 _TITLE = 48  # height of a panel's title, in pixels
 _LEGEND = 92  # height of a panel's legend, in pixels
 _MARGIN = 28  # pixels between the border of a panel and its content
-_ACROSS = 2  # panels in a row of the image
-_PAPER = (255, 255, 255)
-_TRUTH = (150, 156, 166)
-_FRAME = (228, 231, 236)
+_ACROSS = 2  # number of panels in a row of the image
+_PAPER = (255, 255, 255)  # colour (RGB) of the background
+_TRUTH = (150, 156, 166)  # colour (RGB) of the true path
+_FRAME = (228, 231, 236)  # colour (RGB) of the border of a panel
 # A path is not drawn across a gap of more than this many times the median interval between poses.
 _BREAK = 2.5
 # Largest number of panels in an image.

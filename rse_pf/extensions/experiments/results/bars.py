@@ -22,7 +22,7 @@ def with_bars(figures: Mapping[str, Any], bars: Bars) -> dict[str, Any]:
 
 
 def is_met(value: Any, sense: str, limit: float) -> bool:
-    """Return whether *value* is at most (``<=``) or at least (``>=``) *limit*; None never is."""
+    """Return whether *value* is at most (``<=``) or at least (``>=``) *limit*; None never meets a limit."""
     return value is not None and bool(value <= limit if sense == "<=" else value >= limit)
 
 

@@ -32,7 +32,7 @@ from rse_pf.extensions.experiments.results.summary import summarise
 
 __all__ = ["LIVE_FAULT_BARS", "fault_rows", "live_fault_figures"]
 
-# Faults after which another server must serve the map.
+# Names of the faults after which another server must serve the map.
 _NEW_OWNER = {"kill", "stop", "drain", "roll"}
 # Targets of every fault: nothing that was acknowledged is lost, and the replayed log gives the same map.
 _NO_LOSS = {

@@ -103,7 +103,7 @@ def merge_section(
 
     ``ate_cm`` is the ATE of all frames of the joined robots after one rigid alignment of all robots to the
     truth. ``ate_before_cm`` is the ATE before the merge: since the relative poses of the robots are unknown
-    then, each robot is aligned by itself, so that only its drift counts.  ``ate_stiff_cm`` is that of the
+    then, each robot is aligned by itself, so that only its drift counts.  ``ate_stiff_cm`` is the ATE of the
     maps moved rigidly to their poses in the merged map, without the optimisation.  ``origins`` is the error
     of each robot's first pose relative to that of the first robot.
     """

@@ -19,8 +19,8 @@ __all__ = ["RERUN", "FigureReached", "rerun_arguments", "rerun_figures", "rerun_
 
 RERUN = "rerun"
 """Member of a report that holds the plan."""
-# Tolerance: a "<=" target is multiplied by this factor for a short run, a ">=" target divided by it.
-_SLACK = 1.5
+# Factor of tolerance for a short run: a "<=" target is multiplied, a ">=" target divided by this factor.
+_TOLERANCE_FACTOR = 1.5
 # A target in a report, such as "<= 1.5".
 _BAR = re.compile(r"(<=|>=) (-?\d+(\.\d+)?(e[-+]?\d+)?)")
 
@@ -46,7 +46,7 @@ class FigureReached:
 def rerun_plan(arguments: Sequence[str], bars: Bars) -> dict[str, Any]:
     """Return the plan for a report: arguments of ``rse-pf experiment KIND``, tolerance and targets."""
     bar_texts = {name: f"{sense} {bar:g}" for name, (bar, sense) in bars.items()}
-    return {"arguments": list(arguments), "slack": _SLACK, "bars": bar_texts}
+    return {"arguments": list(arguments), "slack": _TOLERANCE_FACTOR, "bars": bar_texts}
 
 
 def rerun_arguments(report: Mapping[str, Any]) -> list[str]:

@@ -50,8 +50,9 @@ class AuditRows:
     ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the new entries in two lists: rows of the Events view, and events of the control plane.
 
-        Each new entry is in one of the lists: in the second one if its action begins with `PLATFORM`, else in
-        the first one.  The caller makes rows of the events, as of those in the control plane's own stream.
+        An entry whose action begins with `PLATFORM` is in the list of events of the control plane, every
+        other entry is a row.  The caller makes rows of these events, as of the events in the control plane's
+        stream.
 
         Args:
             is_reported: Returns whether the stream of the control plane has reported an event already; such

@@ -10,7 +10,7 @@ from pathlib import Path
 
 __all__ = ["FileTail"]
 
-# Largest number of bytes that one call reads of a file; of more, the last ones are read.
+# Largest number of bytes that one call reads of a file; of more new bytes, only the last ones are read.
 _MAX_READ_BYTES = 1 << 20
 # Number of bytes at the end of a file that the first call reads, and largest part of a line that is stored.
 _TAIL_BYTES = 1 << 18

@@ -51,7 +51,7 @@ class LiveFeed:
         self._followed: dict[str, asyncio.Task[None]] = {}
 
     async def run(self) -> None:
-        """Connect to the platform while a page is open, and follow the maps it shows, until cancelled."""
+        """Connect to the platform while a page is open, and follow the maps on it, until cancelled."""
         while True:
             if self._hub.watches("maps"):
                 with contextlib.suppress(RsePfError, OSError):

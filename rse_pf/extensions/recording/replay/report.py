@@ -25,7 +25,7 @@ from rse_pf.wire import Failure, Result
 __all__ = ["Attempt", "CommandReport", "report_of"]
 
 _TRIED_INLIER_PX = (2.0, 4.0, 8.0, 16.0)  # inlier thresholds, px, with which a command is solved again
-_TRIED_ITERATIONS = (100, 1000, 10_000)  # numbers of RANSAC iterations with which it is solved again
+_TRIED_ITERATIONS = (100, 1000, 10_000)  # numbers of RANSAC iterations with which a command is solved again
 _MAX_NUMBER = 1e12  # largest absolute value in a report; infinite numbers are replaced by it
 _LIMITS = WeakLimits()  # limits of the rules that decide whether a pose is weak
 
@@ -40,7 +40,7 @@ class Attempt(msgspec.Struct, frozen=True, kw_only=True):
         inliers: Number of inliers.
         rmse_px: Root mean square reprojection error of the inliers, px.
         moved_m: Distance from the recorded position, metres; None if one of the two poses is missing.
-        moved_deg: Rotation from the recorded orientation, degrees; None as above.
+        moved_deg: Rotation from the recorded orientation, degrees; None if one of the two poses is missing.
     """
 
     name: str

@@ -34,7 +34,7 @@ __all__ = ["TIMES_AND_PLACES", "Again", "Overrides", "Resolver", "pnp_reply", "s
 
 TIMES_AND_PLACES = ("server", "queue_ms", "compute_ms", "received_s", "sent_s", "trace")
 """Fields of answers with times, server and trace, which are not compared: they differ each time."""
-_MAX_TRIED_ITERATIONS = 100_000  # as many as options can ask for; a server allows fewer
+_MAX_TRIED_ITERATIONS = 100_000  # most RANSAC iterations of a replay: the largest option; servers allow fewer
 _POSES_SERVICE = "pnp"  # name of the service that computes poses
 
 

@@ -35,7 +35,7 @@ _MAX_SPEED_M_S = 3.0  # largest speed of a robot that is no jump, m/s
 _MAX_ROTATION_DEG_S = 180.0  # largest angular rate of a robot that is no jump, degrees per second
 _MIN_JUMP_M = 0.3  # smallest translation that is a jump, metres: noise is smaller
 _MIN_JUMP_DEG = 15.0  # smallest rotation that is a jump, degrees: noise is smaller
-# largest difference from odometry that is no jump, as a share of the motion by odometry
+# Largest difference from odometry that is no jump, as a share of the motion by odometry.
 _ODOMETRY_SHARE = 0.3
 
 
