@@ -18,7 +18,7 @@ from pathlib import Path
 
 from fuzz.meter import BARS, Meter
 
-_INPUTS_PER_SEED = 500
+_INPUTS_PER_SEED = 500  # number of damaged inputs that Hypothesis makes from one seed
 _TARGETS = (
     "codec", "frames", "stream", "geometry", "maps", "keyframes", "snapshots", "graph", "cloud",
     "match", "depth", "describe", "track", "stereo", "live",
@@ -108,7 +108,7 @@ def _write_input(folder: Path, data: bytes) -> Path:
 
 
 def _with_atheris(options: argparse.Namespace) -> None:
-    """Run libFuzzer in this process, which libFuzzer exits."""
+    """Run libFuzzer in this process; libFuzzer ends the process itself."""
     import atheris
 
     with atheris.instrument_imports(include=["rse_pf"]):
@@ -128,7 +128,8 @@ def _with_atheris(options: argparse.Namespace) -> None:
         try:
             run(data, meter)
         except Exception:
-            # A libFuzzer that was loaded before Python ends without writing the input of an exception.
+            # If libFuzzer is loaded before Python, it exits without writing the input that raised an
+            # exception.
             print(f"{options.target}: {_write_input(options.found, data)} failed", file=sys.stderr)
             raise
         if meter.worst_ms > max(worst, 1.0):

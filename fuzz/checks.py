@@ -12,10 +12,10 @@ Target = Callable[[bytes, Meter], None]
 
 
 class TargetFailure(AssertionError):
-    """The product violates one of its rules."""
+    """A fuzz target found that the product violates one of its rules."""
 
 
 def expect(holds: bool, otherwise: str) -> None:
-    """Raise `TargetFailure` with *otherwise* unless *holds*."""
+    """Raise `TargetFailure` with the message *otherwise* unless the condition *holds*."""
     if not holds:
         raise TargetFailure(otherwise)

@@ -1,4 +1,4 @@
-"""The fuzz targets of the native core's front end, depth refinement and tracker: any numbers and sizes.
+"""Fuzz the native core's front end, depth refinement and tracker with any numbers and sizes.
 
 Each target calls the library through the Python binding, and directly with buffers of the smallest size that
 the C ABI allows.
@@ -38,11 +38,13 @@ __all__ = ["HOSTILE_SIZES", "GuardedBuffer", "depth", "describe", "match", "trac
 Anything = npt.NDArray[Any]
 
 _CAMERA = Camera(fx=300.0, fy=310.0, cx=3.5, cy=4.0, width=640, height=480)
-_HEAD = 8  # bytes at the start of an input that choose sizes and kinds; the others are the data
+_HEAD = 8  # number of bytes at the start of an input that choose sizes and kinds; the others are the data
+# Sizes of arrays that no caller may pass to the library, which has to refuse them.
 HOSTILE_SIZES = (-1, -(2**63), 2**24 + 1, 2**31, 2**60, 2**63 - 1)
 _PATTERN = 0xA5  # value of each byte of the guard behind a buffer
-_GUARD_BYTES = 64  # size of that guard
-_LEVELS = 8  # of ORB's pyramid
+_GUARD_BYTES = 64  # size of the guard behind a buffer
+_LEVELS = 8  # number of levels of ORB's image pyramid
+# Values of options that an input may choose instead of ordinary numbers.
 _SPECIAL_NUMBERS = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
 
 
@@ -193,7 +195,7 @@ def describe(data: bytes, meter: Meter) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         pixels, angles_deg = numbers[: 2 * n].astype(np.float32), numbers[2 * n :].astype(np.float32)
     octaves = np.resize(np.frombuffer(body, np.int8), n).astype(np.int32)
-    if kind & 4 and 1.0 <= scale <= 2.0:  # most of them inside
+    if kind & 4 and 1.0 <= scale <= 2.0:  # most of the keypoints lie inside the picture
         octaves = octaves % 4
         edge = np.repeat(23.0 * scale**octaves, 2).reshape(n, 2)
         buffer = np.maximum((width, height) - 2.0 * edge, 1.0)
@@ -390,7 +392,7 @@ def _fit(data: bytes, meter: Meter) -> None:
     T, points, spreads, pixels, deviations, depths_m, depths_dev_m = np.split(
         numbers, np.cumsum((16, 3 * n, 6 * n, 2 * n, n, n))
     )
-    if kind & 128:  # what a camera may measure
+    if kind & 128:  # points that a camera may measure
         T, depths_m = np.eye(4).ravel(), np.clip(np.nan_to_num(depths_m), 0.0, 9.0)
         points = np.clip(np.nan_to_num(points), -20.0, 20.0)
         pixels = np.clip(np.nan_to_num(pixels), -900.0, 900.0)
@@ -450,7 +452,7 @@ class GuardedBuffer:
 
 
 def _cut(array: Anything, how: int) -> Anything:
-    """Return a copy of *array* at the end of its memory block; at an odd address if *how* is odd."""
+    """Return a copy of *array* at the end of its memory block, at an odd address if *how* is odd."""
     if not how % 2:
         return np.array(array)
     moved = np.frombuffer(b"\0" + array.tobytes(), np.uint8)[1:]
@@ -479,7 +481,11 @@ def _all_equal(found: tuple[Any, ...], expected: tuple[Any, ...]) -> bool:
     )
 
 
-_P, _I, _D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+# Types of arguments in `_SIGNATURES`: pointer, integer, double.
+_P = ctypes.c_void_p
+_I = ctypes.c_int64
+_D = ctypes.c_double
+# Argument types and result type of each function of the library.
 _SIGNATURES = {
     "rse_pf_match": ((_P, _I, _P, _I, _D, ctypes.c_uint32, _P, _P, _P), _I),
     "rse_pf_points_at": ((_P, _I, _I, _P, _I, *[_D] * 7, _P), ctypes.c_int32),

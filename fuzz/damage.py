@@ -1,7 +1,7 @@
 """Damaged inputs from Hypothesis: well-formed samples with bytes replaced, inserted, removed or repeated.
 
-The engine for machines without atheris, and for the tests, where runs must be equal: the same seed gives the
-same inputs.
+This engine is for machines without atheris and for the tests, whose runs must be equal: the same seed gives
+the same inputs.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from fuzz.samples import MAX_INPUT_BYTES, samples
 
 __all__ = ["damaged", "run_damaged"]
 
+# Texts that edits insert: parts of JSON and MessagePack, and boundary values.
 _TOKENS = (
     b"[", b"]", b"{", b"}", b'"', b"\\", b"\\u0000", b"\\ud800", b",", b":", b"null", b"true", b"1e308",
     b"-0.0", b"1e999", b"NaN", b"9007199254740992", b"18446744073709551616", b'"type":', b'"command"',
@@ -28,9 +29,11 @@ _TOKENS = (
     b"\x88\x02\x03\xe8", b"\x89\x00", b"\x80\x00", b"\x00\x00", b"\x81\xfe\xff\xff", b"\x78\x9c",
     b"\x00\x00\xff\xff",
 )  # fmt: skip
+# Number of repeats of an insertion by the byte that chooses it; other bytes insert once.
 _REPEATS = {255: 65_536, 254: 4096, 253: 256, 252: 64, 251: 16, 250: 4, 249: 2}
 _EDIT = struct.Struct("<HBBBB")
-"""Where, how many bytes are removed, what is inserted (two bytes), and how often."""
+"""An edit of a sample: position, number of removed bytes, two bytes that choose the insertion, and
+repeats."""
 
 
 def damaged(target: str) -> st.SearchStrategy[bytes]:
@@ -57,7 +60,7 @@ def run_damaged(target: str, run: Callable[[bytes], None], *, first: int, inputs
     """Call *run* with the samples of *target*, then with *inputs* damaged ones of seed *first*.
 
     Raises:
-        Exception: Whatever *run* raised for an input.
+        Exception: The exception that *run* raised for an input.
     """
     for data in samples(target):
         run(data)

@@ -1,9 +1,9 @@
-"""Mutated HTTP requests: what `rse_pf.http.connections` accepts, `h11` understands in the same way.
+"""Compare the HTTP parser of `rse_pf.http.connections` with that of `h11` on mutated requests.
 
     python -m fuzz.http_twin [--count 100000] [--seed 1]
 
-A request is accepted when its head and its whole body are.  `h11` must then accept it, too, with the same
-method, target, headers and body.
+A request is accepted if its head and its whole body are accepted.  `h11` must then accept the request as
+well, with the same method, target, headers and body.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ _TOKENS = (
     b"\r\n\r\n", b"HTTP/1.1", b"HTTP/1.0", b"99999999999999999999", b"1_0", b"http://x/", b"*", b"\x85",
     b"[", b"/", b"\x1f",
 )  # fmt: skip
-_LOOP_ROUNDS = 4  # of the event loop, in which the application reads and answers a request
+_LOOP_ROUNDS = 4  # rounds of the event loop in which the application reads and answers a request
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request with its body."""
+    """An HTTP request as a parser understands it: method, target, headers and body."""
 
     method: bytes
     target: bytes
@@ -59,12 +59,12 @@ class Request:
 
 
 def mutated(source: random.Random) -> bytes:
-    """Return a request, most often with some bytes changed."""
+    """Return the bytes of a random request, most often with some bytes changed."""
     lines = [source.choice(_STARTS), *source.choices(_LINES, k=source.randrange(6))]
     if source.random() < 0.9:
         lines.append(b"Host: a")
     body = source.choice(_BODIES)
-    if source.random() < 0.5:  # a frame that fits the body
+    if source.random() < 0.5:  # a Content-Length that fits the body
         lines.append(b"Transfer-Encoding: chunked" if b"\r\n" in body else b"Content-Length: %d" % len(body))
     source.shuffle(rest := lines[1:])
     data = bytearray(b"\r\n".join([lines[0], *rest]) + b"\r\n\r\n" + body)
@@ -143,9 +143,9 @@ def read_by_h11(data: bytes) -> Request | None:
 
 
 async def disagreement(data: bytes, pieces: list[bytes]) -> tuple[bool, str]:
-    """Return whether the request in *data* is accepted, and how `h11` reads it otherwise; empty if alike.
+    """Return whether the request in *data* is accepted, and how `h11` disagrees; empty if both agree.
 
-    *pieces* are *data* as it arrives.
+    *pieces* are the parts in which *data* arrives.
     """
     served = await requests_served(pieces)
     expected = read_by_h11(data)
@@ -154,7 +154,7 @@ async def disagreement(data: bytes, pieces: list[bytes]) -> tuple[bool, str]:
 
 
 async def compare(count: int, seed: int) -> tuple[int, list[str]]:
-    """Return how many of *count* mutated requests are accepted, and what `h11` reads otherwise."""
+    """Return how many of *count* mutated requests are accepted, and the disagreements with `h11`."""
     source = random.Random(seed)
     accepted, problems = 0, []
     for _ in range(count):
@@ -168,7 +168,7 @@ async def compare(count: int, seed: int) -> tuple[int, list[str]]:
 
 
 def main() -> int:
-    """Compare many samples and print what is read differently."""
+    """Compare many mutated requests, and print the disagreements of both parsers."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

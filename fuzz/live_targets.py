@@ -1,6 +1,6 @@
-"""The fuzz target of a live map's keyframes: decoding them, and computing with their features.
+"""Fuzz the keyframes of live maps: their decoding, and computations with their features.
 
-Keyframes are decoded in the process that owns the map, so their cost has the bars of a robot's message.
+Keyframes are decoded in the map server, so that their cost has the limits of a message of a robot.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from tests.kit.synthetic_maps import make_world
 
 __all__ = ["live"]
 
-_FEATURE_BYTES = 38
-_UNITS_BYTES, _DEPTHS_BYTES = 36, 2
+_FEATURE_BYTES = 38  # size of an encoded feature
+_UNITS_BYTES = 36  # size of the pixel and descriptor of an encoded feature
+_DEPTHS_BYTES = 2  # size of the depth of an encoded feature
 
 
 def live(data: bytes, meter: Meter) -> None:
-    """Check that bytes as a keyframe give one within bounds, or an error of ours.
+    """Check that any bytes give a keyframe within bounds, or one of our errors.
 
-    A keyframe survives encoding and decoding, and whatever it holds, links and places come out with finite
-    numbers.  An odd first byte means that the heads are written here, so that the rest is taken as features.
+    A keyframe is equal after encoding and decoding, and loop closures and place vectors computed from it hold
+    finite numbers.  If the first byte is odd, valid heads are written here, and the other bytes are features.
     """
     if not data:
         return

@@ -1,7 +1,7 @@
-"""The fuzz targets of maps, keyframes, messages of sandboxes, pose graphs and point clouds.
+"""Fuzz maps, keyframes, messages of sandboxes, pose graphs and point clouds.
 
 Maps and payloads of map services are computed in processes that may be killed; messages of a sandbox are
-read in the worker itself, so their cost has the bars of a robot's message.
+read in the worker itself, so that their cost has the limits of a message of a robot.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ __all__ = ["cloud", "graph", "keyframes", "maps", "snapshots"]
 _SETTINGS = PlatformSettings()
 _REGISTRY = builtin_services(_SETTINGS)
 _CODECS = tuple(make_codec(name, _SETTINGS.session) for name in ("bin", "json"))
-_MAGIC = b"RSEMAP1\n"
+_MAGIC = b"RSEMAP1\n"  # first bytes of a map
 _LONG_TEXT = 16_384
 """Longest text of a pose graph in bytes, so that many graphs are tried in a second; the rest is ignored."""
 _CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 
 def maps(data: bytes, meter: Meter) -> None:
-    """Check that bytes give a map or a typed error; an even first byte means that the rest is deflated here.
+    """Check that any bytes give a map or a typed error.
 
-    A map survives encoding and decoding; its provenance is readable or raises BadRequest.
+    If the first byte is even, the other bytes are deflated here before they are decoded.  A map is equal
+    after encoding and decoding; its provenance is readable or raises BadRequest.
     """
     if not data:
         return
@@ -61,7 +62,7 @@ def maps(data: bytes, meter: Meter) -> None:
 def keyframes(data: bytes, meter: Meter) -> None:
     """Check that ``place`` and ``localise`` answer any features of a keyframe, or fail with a typed error.
 
-    The first bytes choose how many features there are, from where each array is taken, and the options.
+    The first bytes choose the number of features, the position of each array in *data*, and the options.
     """
     if len(data) < 8:
         return
@@ -94,9 +95,9 @@ def keyframes(data: bytes, meter: Meter) -> None:
 
 
 def snapshots(data: bytes, meter: Meter) -> None:
-    """Check that what a sandbox writes gives messages or a typed error, and that answers can be encoded.
+    """Check that any output of a sandbox gives messages or a typed error, and that answers can be encoded.
 
-    The first byte decides whether the rest is a stream, or one message whose length is written here.
+    The first byte decides whether the others are a stream, or one message whose length is written here.
     """
     if not data:
         return
@@ -137,7 +138,7 @@ def cloud(data: bytes, meter: Meter) -> None:
         return
     kind, count = data[0] % 4, 3 * (100 + data[1])
     numbers = _numbers(kind, data[12:], 2 * count)
-    if data[2] % 2:  # a sound target, so that the solver is reached
+    if data[2] % 2:  # a valid target cloud, so that the solver is reached
         numbers[:count] = (np.array(_ROOM[:count]) * (1.0 + data[3])).tolist()
     options = {
         "voxel_m": (data[4] + 1) / 64.0, "reach_m": (data[5] + 1) / 8.0, "max_iterations": data[6],
@@ -178,7 +179,7 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
     elif kind == 2:
         found = np.frombuffer(data[: len(data) // 2 * 2], "<i2").astype(np.float64) / 256.0
     else:
-        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet NaN
             found = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
     return np.resize(found, count).tolist() if len(found) else [0.0] * count
 

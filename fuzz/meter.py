@@ -1,4 +1,4 @@
-"""CPU time and memory of the most expensive message.
+"""Measure CPU time and memory of the most expensive input of a fuzz target.
 
 CPU time of the thread is measured, not elapsed time, and an expensive call is repeated before it counts, so
 that a pause of the machine is not taken for cost.
@@ -14,8 +14,8 @@ from typing import Any
 
 __all__ = ["BARS", "MAX_MIB", "MAX_MS", "Meter"]
 
-MAX_MS = 10.0
-MAX_MIB = 2.0
+MAX_MS = 10.0  # largest CPU time of one message of a robot
+MAX_MIB = 2.0  # largest memory of one message of a robot
 BARS = {
     "codec": (MAX_MS, MAX_MIB),
     "snapshots": (MAX_MS, 16.0),
@@ -26,12 +26,12 @@ BARS = {
 
 _TRACED_FROM_MS = 0.5
 """Shortest CPU time of a call whose memory is measured: a shorter call cannot allocate 2 MiB."""
-_TRIES = 3
+_TRIES = 3  # number of repetitions of an expensive call, of which the shortest counts
 
 
 @dataclass(slots=True)
 class Meter:
-    """The most expensive of many calls, with their inputs."""
+    """Keeps the largest CPU time and memory of many calls, with the inputs that caused them."""
 
     calls: int = 0
     worst_ms: float = 0.0
@@ -41,10 +41,10 @@ class Meter:
     refusals: dict[str, int] = field(default_factory=dict)
 
     def call(self, function: Callable[[bytes], Any], data: bytes, allowed: type[Exception]) -> Any:
-        """Return ``function(data)``, or None where it refused with an *allowed* error.
+        """Measure ``function(data)``, and return its result, or None if it raised an *allowed* error.
 
         Raises:
-            Exception: Whatever else *function* raised.
+            Exception: Any other exception that *function* raised.
         """
         self.calls += 1
         took_ms, answer, refusal = _timed(function, data, allowed)
@@ -61,7 +61,7 @@ class Meter:
         return answer
 
     def line(self) -> str:
-        """Return the figures in one line."""
+        """Return the largest CPU time and memory, with their inputs, as one line of text."""
         refused = ", ".join(f"{code} {count}" for code, count in sorted(self.refusals.items())) or "nothing"
         return (
             f"{self.calls} calls; slowest {self.worst_ms:.2f} ms ({len(self.slowest)} bytes, "

@@ -36,7 +36,7 @@ MAX_INPUT_BYTES = 262_144
 
 @cache
 def samples(target: str) -> tuple[bytes, ...]:
-    """Return the initial inputs of *target*: those made here, then the files of its folder in `CORPUS`."""
+    """Return the initial inputs of *target*: first those of this module, then its files in `CORPUS`."""
     kept = [file.read_bytes() for file in sorted((CORPUS / target).glob("*"))]
     return (*_MADE[target](), *kept)
 
@@ -120,11 +120,14 @@ def _text(size: int) -> bytes:
     return b"".join(b"%06d%s" % (k, b"a" * 100) for k in range(size // 106))
 
 
-_COUNT, _ALL, _VALUES = 24_900, 1_048_000, 29_900
+_COUNT = 24_900  # number of entries of an expensive map
+_ALL = 1_048_000  # size in bytes of an expensive text, below the limit of 1 MiB after inflation
+_VALUES = 29_900  # number of texts in an expensive list
 _PACKED_KEYS = b"".join(b"\xa5k%04x\1" % k for k in range(14_900))
 _KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
 _NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
-_EMPTY_BLOCK_BITS = 0b10  # not the last block, fixed codes, and the code that ends it: ten bits
+# Ten bits of an empty deflate block: not the last block, fixed codes, and the code that ends the block.
+_EMPTY_BLOCK_BITS = 0b10
 _EMPTY_BLOCKS = sum(_EMPTY_BLOCK_BITS << 10 * k for k in range(4)).to_bytes(5, "little")
 _DIGITS = b"".join(b"0.%016d," % (k * k * 2654435761 % 10**16) for k in range(29_000))
 
@@ -176,7 +179,7 @@ EXPENSIVE: dict[str, tuple[str, bytes]] = {
     "few empty blocks": ("zlib", b"\x78\x9c" + _EMPTY_BLOCKS * 1_600),
     "bomb": ("zlib", zlib.compress(b"[" * 50_000_000, 9)),
 }  # fmt: skip
-"""Name to codec and message."""
+"""The expensive messages: codec and bytes by name; "that may be" marks messages within every limit."""
 
 
 def _maps() -> list[bytes]:

@@ -1,6 +1,6 @@
-"""The fuzz target of the native core's stereo matcher: any two pictures, pixels and limits.
+"""Fuzz the native core's stereo matcher with any two pictures, pixels and limits.
 
-It calls the library through the Python binding, and directly with hostile sizes.
+The target calls the library through the Python binding, and directly with hostile sizes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from tests.oracles import disparities as oracle
 
 __all__ = ["stereo"]
 
-_HEAD = 8
+_HEAD = 8  # number of bytes at the start of an input that choose sizes and limits
+# Values of options that an input may choose instead of ordinary numbers.
 _SPECIAL_NUMBERS = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
 
 
@@ -42,7 +43,7 @@ def stereo(data: bytes, meter: Meter) -> None:
     found = meter.call(lambda _: disparities(left, right, where, options), data, ProtocolError)
     expect(found is not None, "a pair was refused")
     expected = oracle.disparities(left, right, where, options)
-    # Where an iteration is about to fail, or two places are alike, the order of a sum decides.
+    # If an iteration is about to fail, or two positions match equally well, the order of a sum decides.
     differ = ~np.isclose(found, expected, atol=1e-6, equal_nan=True)
     expect(int(differ.sum()) <= 1 + n // 50, "disparities are not those of the definition")
     known = found[np.isfinite(found)]

@@ -1,7 +1,7 @@
 """The fuzz targets: one function for each part of the product that reads bytes from outside.
 
-A target takes any bytes and returns; it raises `TargetFailure`, or the error that escaped, when the product
-is wrong.  Targets are deterministic and use no socket and no file.
+A target accepts any bytes.  If the product violates one of its rules, the target raises `TargetFailure` or
+the error of the product.  Targets are deterministic and use no socket and no file.
 """
 
 from __future__ import annotations
@@ -37,32 +37,43 @@ from rse_pf.wire.server_codec import make_server_codec
 
 __all__ = ["TARGETS", "Target", "TargetFailure", "codec", "framed", "frames", "geometry", "stream"]
 
-PLATFORM = PlatformSettings()
+PLATFORM = PlatformSettings()  # settings with the default limits of a server
+# Low limits of messages and fragments, which short inputs of the target ``frames`` can exceed.
 NARROW = SessionSettings(max_message_bytes=2000, max_fragments=4)
-NARROW_CONTROL_PER_S = 3.0
-_CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG = 0, 1, 2, 8, 9, 10
+NARROW_CONTROL_PER_S = 3.0  # limit of control frames per second of the target ``frames``
+# Opcodes of WebSocket frames (RFC 6455, section 5.2).
+_CONTINUATION = 0
+_TEXT = 1
+_BINARY = 2
+_CLOSE = 8
+_PING = 9
+_PONG = 10
 
+# Codecs that the first byte of an input selects; the fourth choice also deflates the message.
 _CODECS = ("bin", "json", "zlib", "zlib")
-# MessagePack has maps with keys of None, which JSON has not; JSON has integers of more than 64 bits.
+# Each codec has its own encoder: MessagePack has maps with keys of None, JSON integers of more than 64 bits.
 _ENCODERS = {
     "bin": msgspec.msgpack.Encoder(enc_hook=json_encode_hook).encode,
     "json": msgspec.json.Encoder(enc_hook=json_encode_hook).encode,
 }
 _SHORT = 8192
-"""Longest message whose payload is tried on every service, in bytes, so that many inputs are tried."""
+"""Longest message, in bytes, whose payload is passed to every service; it bounds the time of an input."""
 _REGISTRY = builtin_services(PLATFORM)
+# Codecs of a server, by name.
 _MADE = {
     name: make_server_codec(name, PLATFORM.session, read_first=pnp_reader(_REGISTRY, name)) for name in CODECS
 }
+# Codecs of a robot, by name.
 _OF_ROBOTS = {name: make_codec(name, PLATFORM.session) for name in CODECS}
 _SERVICES: tuple[Service, ...] = tuple(_REGISTRY)
 
 
 def codec(data: bytes, meter: Meter) -> None:
-    """Check the codec that the first byte selects; the rest is the message, which the fourth choice deflates.
+    """Check the codec that the first byte selects with the other bytes as its message.
 
-    Only protocol errors are raised; a decoded message survives encoding and decoding; a payload gives a
-    request of a service or one of our errors.  A server reads what a robot would read.
+    Only protocol errors may be raised; a decoded message is equal after encoding and decoding; a payload
+    gives a request of a service or one of our errors.  The codecs of server and robot decode the same
+    message.
     """
     if not data:
         return
@@ -90,7 +101,7 @@ def _compare_with_robots(chosen: Codec, data: bytes) -> None:
     """Check that the server's codec *chosen* decodes and refuses the same messages as the robot's codec."""
     got, expected = (_outcome(each, data) for each in (chosen, _OF_ROBOTS[chosen.name]))
     if chosen.name == "zlib" and (got[0] == "zlib" or expected[0] == "zlib"):
-        return  # isal ignores the size of the window in the head, which no part of the stream needs
+        return  # isal ignores the size of the window in the zlib header, which decoding does not need
     expect(got == expected, "server and robot decode a message differently")
 
 
@@ -113,7 +124,7 @@ def _as_requests(payload: Any) -> None:
         try:
             request_of(payload, service)
         except InternalError as error:
-            raise TargetFailure(f"{service.name} calls a payload a defect") from error
+            raise TargetFailure(f"{service.name} reports a payload as an internal error") from error
         except RsePfError:
             continue
 
@@ -228,7 +239,7 @@ def geometry(data: bytes, meter: Meter) -> None:
 
 
 def check_pose(answer: Result, points: np.ndarray) -> None:
-    """Raise `TargetFailure` unless the pose is rigid, and not ok for a line or a single point."""
+    """Raise `TargetFailure` if the pose is not rigid, or is ``ok`` for points on a line or a single point."""
     reply = answer.reply
     T = np.asarray(reply.T_camera_world).reshape(4, 4)
     expect(bool(np.isfinite(T).all() and np.isfinite(reply.covariance).all()), "a pose that is not finite")

@@ -1,14 +1,16 @@
-"""Build the packages of the cloud: archives of a server's environment, an unpacked folder for the function.
+"""Build the packages for AWS: archives of a server's Python environment, and the folder of the Lambda
+function.
 
     python scripts/assets.py [--into build] [--arm]
 
-Installs wheels only, by the hashes of the locks, and runs nothing that it downloads; with --arm it runs the
-compiler of locks/tools.txt.  The build is reproducible: the time of every entry is SOURCE_DATE_EPOCH (by
-default the earliest of a zip file).  Nothing is built when neither a lock nor a source has changed; the
+The script installs wheels only, by the hashes of the locks, and runs no downloaded program; with --arm it
+runs the compiler of locks/tools.txt.  The build is reproducible: the time of every entry is SOURCE_DATE_EPOCH
+(by default the earliest of a zip file).  Nothing is built when neither a lock nor a source has changed; the
 network is needed only for a changed lock.
 
-A server unpacks its virtual environment instead of installing it: libraries.tar.gz holds what the lock names,
-platform.tar.gz holds ours.  Only a changed lock makes the first one anew.
+A server unpacks its virtual environment instead of installing it.  The two archives libraries-N.tar.gz hold
+the packages of the lock, platform.tar.gz holds the packages of this repository.  The archives of the
+libraries are built again only after a change of the lock.
 
 Both packages hold bytecode, because the processes that run them may not write it there.  That needs a Python
 of the same version (python3.11 for servers, python3.13 for the function); without one, each start compiles.
@@ -34,36 +36,39 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("rse_pf", "client_sdk", "lambda_pnp")
-EPOCH = "315532800"
+PACKAGES = ("rse_pf", "client_sdk", "lambda_pnp")  # packages of this repository in the wheel
+EPOCH = "315532800"  # default of SOURCE_DATE_EPOCH: 1980-01-01, the earliest time of a zip file
+# Packages of this repository in the Lambda function.
 LAMBDA_PACKAGES = ("rse_pf", "lambda_pnp")
 UNUSED = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
 """Folders of wheels that are never used at run time."""
-UNUSED_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
+UNUSED_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")  # endings of files that are never used at run time
 UNUSED_BY_SERVERS = ("tests", "__pycache__", "_pytest", "pytest", "pluggy", "pygments", "iniconfig")
-"""The same for servers, whose own services may use more; gtsam asks for pytest and never imports it."""
+"""Folders that servers never use; a service may use others.  gtsam requires pytest, but never imports it."""
 SAMPLES = ("gtsam/Data/", "gtsam_unstable/", "cv2/data/")
-"""Data of examples and what is built on them: 50 MB."""
+"""Folders with data of examples, which are left out: 50 MB."""
 APIS = (
     "autoscaling", "cloudwatch", "cloudformation", "ec2", "elbv2", "lambda", "logs", "s3", "secretsmanager",
     "sns", "sqs", "ssm", "sts",
 )  # fmt: skip
-"""AWS services that a server may call: it gets botocore's descriptions of these alone.  The descriptions of
-all 400 services are 30 MB in 2,000 files."""
-DEBIAN_12 = ("3.11", 36)
-AMAZON_2023 = ("3.13", 34)
+"""AWS services that a server may call; of botocore's descriptions only theirs are packed, since those of all
+400 services are 30 MB in 2,000 files."""
+DEBIAN_12 = ("3.11", 36)  # Python, and minor version of glibc 2, of servers
+AMAZON_2023 = ("3.13", 34)  # Python, and minor version of glibc 2, of the Lambda function
 FUNCTION_FOLDER = "/var/task"
-"""Where Lambda puts the function, for its tracebacks."""
+"""Folder in which Lambda unpacks the function, as its tracebacks name it."""
 ENVIRONMENT = "/opt/rse-pf/venv"
-"""Where a server unpacks its environment: stacks/boot/install.py."""
+"""Folder in which a server unpacks its environment, see stacks/boot/install.py."""
 LIBRARIES = ("libraries-0.tar.gz", "libraries-1.tar.gz")
-"""Archives of about the same size, which a server unpacks at the same time."""
-PLATFORM, ENVIRONMENT_FILE = "platform.tar.gz", "environment.json"
+"""Archives of the libraries, of about the same size, which a server unpacks concurrently."""
+PLATFORM = "platform.tar.gz"  # archive of the packages of this repository
+ENVIRONMENT_FILE = "environment.json"  # file with the inputs and the target of the archives
+# Files of the native core from which it is compiled.
 NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "*.py", "Makefile", "*.toml", "*.md")
 
 
 def main() -> int:
-    """Build both folders, or print in two lines why that failed."""
+    """Build the packages of servers and function, or print why that failed; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--into", type=Path, default=ROOT / "build", metavar="DIR")
     parser.add_argument("--arm", action="store_true", help="build the native core for aarch64, too (100 MB)")
@@ -118,7 +123,7 @@ def _state_of_the_sources() -> str:
 
 
 def _our_wheel(work: Path) -> Path:
-    """Build our own wheel from a copy, without files of an earlier build."""
+    """Build the wheel of this repository from a copy of the sources, without files of an earlier build."""
     copy = work / "source"
     for file in _sources():
         target = copy / file.relative_to(ROOT)
@@ -162,7 +167,7 @@ def _native_for_arm(into: Path) -> int:
 
 
 def _report_failure(error: subprocess.CalledProcessError) -> int:
-    """Write the end of the output of a command that failed, and how to go on; return the exit status."""
+    """Print the end of the output of a command that failed, with a hint; return the exit status."""
     sys.stderr.write(
         f"{(error.output or '')[-3000:]}assets: {' '.join(error.cmd[:4])} failed\n"
         "  hint: read the output above, and check the network\n"
@@ -191,7 +196,7 @@ def _write_hashes(folder: Path) -> None:
 
 
 def _servers(folder: Path, ours: list[Path], downloads: Path) -> None:
-    """Write the two archives of a server's environment into *folder*, and what they were made of and for."""
+    """Write the archives of a server's environment into *folder*, and a file with their inputs and target."""
     _empty(folder)
     for archive in _libraries(downloads):
         shutil.copyfile(archive, folder / archive.name)
@@ -219,7 +224,7 @@ def _servers(folder: Path, ours: list[Path], downloads: Path) -> None:
 
 
 def _libraries(downloads: Path) -> list[Path]:
-    """Return the archives of what the lock of the servers names, made again only for another lock."""
+    """Return the archives of the packages in the servers' lock; build them only if the lock has changed."""
     archives, stamp = [downloads / name for name in LIBRARIES], downloads / "libraries.sha256"
     state = hashlib.sha256(Path(__file__).read_bytes() + (ROOT / "locks/boot.txt").read_bytes())
     state.update(f"{_python_of(DEBIAN_12[0]) is not None}".encode())
@@ -241,7 +246,7 @@ def _libraries(downloads: Path) -> list[Path]:
 
 
 def _leave_out(site: Path) -> None:
-    """Delete from the libraries what no server uses."""
+    """Delete the files below *site* that no server uses."""
     for name in SAMPLES:
         shutil.rmtree(site / name, ignore_errors=True)
     for api in (site / "botocore" / "data").iterdir():
@@ -250,7 +255,7 @@ def _leave_out(site: Path) -> None:
 
 
 def _halves(tree: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files of *tree* in two lists of about the same size, in order."""
+    """Divide the files of *tree* into two sorted lists of about the same total size."""
     halves: tuple[list[Path], list[Path]] = ([], [])
     sizes = [0, 0]
     files = [path for path in tree.rglob("*") if path.is_file()]
@@ -305,9 +310,9 @@ def _function(folder: Path, ours: Path, core: Path, wheels: Path) -> None:
 
 
 def _compile(folder: Path, version: str, runs_in: str) -> bool:
-    """Add the bytecode of *folder*, which will lie in *runs_in*; return whether there is a Python for it.
+    """Compile *folder* to bytecode for its later path *runs_in*; return whether a Python *version* was found.
 
-    The same sources give the same bytes.
+    The same sources give the same bytecode.
     """
     python = _python_of(version)
     if python is None:
@@ -342,13 +347,13 @@ def _unpack(
     without: tuple[str, ...] = UNUSED,
     endings: tuple[str, ...] = UNUSED_ENDINGS,
 ) -> None:
-    """Put the files of *wheel* into *folder*, but for folders named in *without* and files with *endings*."""
+    """Unpack *wheel* into *folder*, except for folders named in *without* and files with *endings*."""
     with zipfile.ZipFile(wheel) as archive:
         for name in sorted(archive.namelist()):
             parts = Path(name).parts
             if len(parts) > 2 and parts[0].endswith(".data"):
                 if parts[1] not in ("purelib", "platlib"):
-                    continue  # scripts and headers
+                    continue  # files of a wheel that are installed elsewhere, such as scripts and headers
                 parts = parts[2:]
             unused = set(parts[:-1]) & set(without) or name.endswith((*endings, "/"))
             if unused or (only and parts[0] not in only and not parts[0].endswith(".dist-info")):
@@ -360,7 +365,7 @@ def _unpack(
 
 
 def _download(lock: Path, folder: Path, python: str, glibc: int) -> None:
-    """Fill *folder* with the wheels of *lock* for a Python and a glibc 2.x, unless they are there."""
+    """Download the wheels of *lock* for a Python and a glibc 2.x into *folder*, unless they are there."""
     stamp, wanted = folder / "lock.sha256", hashlib.sha256(lock.read_bytes()).hexdigest()
     if stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
         return

@@ -20,6 +20,7 @@ from rse_pf.wire import PROTOCOL_VERSION, SUBPROTOCOLS, FromRobot, FromServer
 
 __all__ = ["asyncapi_document", "main"]
 
+# Reference to a schema of the document by its name.
 _REF = "#/components/schemas/{name}"
 
 
@@ -80,7 +81,7 @@ def asyncapi_document() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the file."""
+    """Write ``docs/asyncapi.json``."""
     path = Path(__file__).resolve().parents[1] / "docs" / "asyncapi.json"
     path.write_text(json.dumps(asyncapi_document(), indent=1) + "\n", encoding="utf-8")
 

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Install the CDK's command line from package-lock.json (once), then run it: sh scripts/cdk.sh [ARGUMENTS]
-# The newest release cannot read this library's assembly, so nothing but the lock decides.
+# Only the version in the lock is used: the newest release cannot read the output of this CDK library.
 set -eu
 cd "$(dirname "$0")/.."
 PATH="$PWD/.venv/bin:$PATH"

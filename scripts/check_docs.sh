@@ -1,5 +1,5 @@
 #!/bin/sh
-# Fail if `make docs` would change a page: somebody forgot to run it.  Then build the site.
+# Fail if `make docs` would change a page, which then has to be committed; otherwise build the site.
 set -eu
 cd "$(dirname "$0")/.."
 before=$(mktemp -d)

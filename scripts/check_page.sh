@@ -1,5 +1,5 @@
 #!/bin/sh
-# Try the fleet page in Debian's Chromium, without its long tests; `make browser` runs all of them.
+# Test the fleet page in Debian's Chromium without the long tests; `make browser` runs all tests of the page.
 set -eu
 cd "$(dirname "$0")/.."
 if ! command -v chromium-headless-shell > /dev/null && ! command -v chromium > /dev/null; then

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Compile the C++ client's driver into client_cpp/build, or say what is missing and how to install it.
+# Compile the test driver of the C++ client into client_cpp/build, or print missing packages with the command that
+# installs them.
 # `sh scripts/client_cpp.sh all` compiles its examples, tests and benchmark, too, and runs the tests.
 set -eu
 cd "$(dirname "$0")/../client_cpp"
@@ -18,7 +19,7 @@ if [ -n "$missing" ]; then
   echo "C++ client: not compiled, without$missing; sudo apt-get install --no-install-recommends $packages" >&2
   exit 3
 fi
-# libopencv-dev, if it is there, adds the example that drives through a recording.
+# With libopencv-dev, the example that drives through a recording is compiled as well.
 cmake -S . -B build > build.log 2>&1 || { cat build.log >&2; exit 1; }
 rm -f build.log
 if [ "${1:-}" = all ]; then

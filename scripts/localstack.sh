@@ -1,6 +1,7 @@
 #!/bin/sh
-# Run the tests of AWS against LocalStack without Docker: set it up from its lock, start it, run, end it.
-# sh scripts/localstack.sh [PYTEST-ARGUMENT...]; by default what needs an endpoint and nothing else.
+# Run the tests of AWS against LocalStack without Docker: install LocalStack from its lock, start it, run the tests,
+# and stop it.
+# sh scripts/localstack.sh [PYTEST-ARGUMENT...]; by default the tests that need an endpoint of AWS.
 set -eu
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
@@ -23,7 +24,7 @@ fi
 rm -rf "$out"
 mkdir -p "$out"
 port=$("$python" -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
-# Nothing is downloaded, counted or resolved for it; it listens to this machine alone.
+# LocalStack downloads nothing, sends no usage data, resolves no names, and listens on loopback only.
 GATEWAY_LISTEN="127.0.0.1:$port" LOCALSTACK_HOST="localhost:$port" LOCALSTACK_VOLUME_DIR="$PWD/$out/volume" \
   DISABLE_EVENTS=1 SKIP_SSL_CERT_DOWNLOAD=1 DNS_ADDRESS=0 \
   "$env/bin/python" -m localstack.runtime.main > "$out/localstack.log" 2>&1 &
@@ -46,5 +47,5 @@ echo "LocalStack: answers on port $port; its log is $out/localstack.log"
 if [ $# -eq 0 ]; then
   set -- tests/aws tests/storage/test_object_store.py tests/cli tests/localstack
 fi
-# One after the other: names of buckets are global.
+# The tests run one after the other, since names of buckets are global.
 PATH="$PWD/.venv/bin:$PATH" LOCALSTACK_HOST="localhost:$port" .venv/bin/python -m pytest -q -rsfEx -n 0 -m "not slow" "$@"

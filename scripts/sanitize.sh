@@ -1,6 +1,7 @@
 #!/bin/sh
 # Build the native core with sanitizers, and run its C++ checks, the Python tests and the fuzz corpus over it:
-# sh scripts/sanitize.sh [SECONDS OF FUZZING].  Needs g++ with libasan; without, says so and ends with 0.
+# sh scripts/sanitize.sh [SECONDS OF FUZZING].  Needs g++ with libasan; without it the script prints a message and
+# exits with 0.
 set -eu
 cd "$(dirname "$0")/.."
 seconds=${1:-20}
@@ -26,7 +27,7 @@ make --no-print-directory -C native OUT="$folder/rse_pf_native" CXX="$compiler" 
 tail -n 1 "$folder.log"
 : > "$folder/rse_pf_native/__init__.py"
 
-# Python's own leaks at exit are no finding; its allocator would hide the ends of its buffers.
+# Leaks of Python at exit are not reported; Python's allocator is off, since it would hide writes beyond a buffer.
 export ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc
 export PYTHONPATH="$folder" LD_PRELOAD="$asan $ubsan"
 
@@ -41,7 +42,7 @@ case $noticed in
 esac
 
 echo "sanitize: Python tests"
-# Left out: what compiles a library of its own, and measures times or memory.
+# Left out are tests that compile a library of their own, and tests that measure times or memory.
 "$python" -m pytest -q -p no:cacheprovider --timeout 900 -m "not slow and not system" \
   tests/pnp/test_degenerate.py tests/pnp/test_engines.py tests/pnp/test_solver.py \
   tests/pnp/test_depth_refinement.py \

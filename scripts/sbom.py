@@ -1,7 +1,8 @@
-"""Add what the package contains of others to bills of materials in CycloneDX: python scripts/sbom.py FILE ...
+"""Add third-party code inside the package to bills of materials in CycloneDX: python scripts/sbom.py FILE ...
 
-The locks name what is installed beside the package.  The fleet page has JavaScript of others within:
-``rse_pf/extensions/fleet_page/static/vendor/vendored.json`` lists it, with versions, licences and digests.
+The bills list the packages of the locks already.  The fleet page contains third-party JavaScript, and
+``rse_pf/extensions/fleet_page/static/vendor/vendored.json`` lists its files with versions, licences and
+digests.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _FOLDER = "rse_pf/extensions/fleet_page/static/vendor"
 
 
 def with_vendored(bill: Mapping[str, Any], packages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return *bill* with a component for each of *packages*, and one within it for each of its files.
+    """Return *bill* with a component for each of *packages*, and in it one for each of its files.
 
     Components of an earlier run are replaced.
     """
@@ -40,7 +41,7 @@ def with_vendored(bill: Mapping[str, Any], packages: Sequence[Mapping[str, Any]]
 
 
 def main(files: Sequence[str]) -> int:
-    """Rewrite each of *files*; return the exit code."""
+    """Add the components to each of the bills *files*; return the exit code."""
     for file in map(Path, files):
         bill = with_vendored(json.loads(file.read_text("utf-8")), vendored())
         file.write_text(json.dumps(bill, indent=2) + "\n", encoding="utf-8")

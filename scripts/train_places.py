@@ -1,7 +1,8 @@
 """Train the vocabulary of `rse_pf.slam.place_recognition` from rendered worlds, and write it to its file.
 
-No recording takes part, so the package carries nobody's images.  The worlds' seeds are used by no test and no
-benchmark.  It needs the package faiss-cpu, and takes about two minutes on one core:
+No recording is used, so that the package contains no data from images of people's homes.  No test and no
+benchmark uses the seeds of these worlds.  The script needs the package faiss-cpu, and takes about two minutes
+on one core:
 
     python scripts/train_places.py
 """
@@ -23,15 +24,16 @@ from client_sdk.simulator.world import make_world
 from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.slam.place_recognition import DIRECTIONS, VOCABULARY_FILE, WORDS
 
-WORLDS = range(101, 107)
-FRAMES, EACH = 410, 8
-"""One round through a world, of which each eighth frame is rendered."""
-SEED = 1
-MAX_TRAINING, KMEANS_ITERATIONS = 20_000, 12
+WORLDS = range(101, 107)  # seeds of the rendered worlds
+FRAMES = 410  # number of frames of one round through a world
+RENDERED_EVERY = 8  # every eighth frame of a round is rendered
+SEED = 1  # seed of the sample of descriptors and of the clustering
+MAX_TRAINING = 20_000  # largest number of descriptors that are clustered
+KMEANS_ITERATIONS = 12  # iterations of the k-means clustering
 
 
 def main() -> None:
-    """Render, train and write."""
+    """Render the worlds, train the vocabulary, and write it to its file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=VOCABULARY_FILE)
     out = parser.parse_args().out
@@ -43,11 +45,11 @@ def main() -> None:
 
 
 def rendered_views(seed: int) -> list[Descriptors]:
-    """Return the descriptors with depth of the frames of one world."""
+    """Return the descriptors of the features with depth, for each rendered frame of the world of *seed*."""
     poses = true_trajectory(0, 1, FRAMES, seed).T_world_camera
     painter, options = Renderer(make_world(seed), SIMULATED_CAMERA), FrontEndOptions()
     views = []
-    for row in range(0, FRAMES, EACH):
+    for row in range(0, FRAMES, RENDERED_EVERY):
         rng = np.random.default_rng([seed, row])
         colour, depth_m, cosine = painter.draw(poses[row])
         frame = Frame(

@@ -2,8 +2,8 @@
 
     python scripts/site/check.py build/site
 
-It reads files only.  A link to another host is allowed; a script, style, font, picture or frame of another
-host is a request, and is not.
+The script reads files only.  A link to another host is allowed.  A script, style, font, picture or frame of
+another host is an error, since a browser would request it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from pathlib import Path
 
 __all__ = ["main", "outside_requests"]
 
+# Attributes by which an HTML element makes a browser load an address.
 _LOADS = {
     "script": ("src",), "img": ("src", "srcset"), "iframe": ("src",), "source": ("src", "srcset"),
     "video": ("src", "poster"), "audio": ("src",), "embed": ("src",), "object": ("data",),
     "form": ("action",), "input": ("src",), "use": ("href",), "image": ("href",),
 }  # fmt: skip
+# Values of ``rel`` with which an element ``link`` makes a browser load its address.
 _LINK_LOADS = {
     "stylesheet",
     "icon",
@@ -31,11 +33,15 @@ _LINK_LOADS = {
     "modulepreload",
     "manifest",
 }
+# An address with another host.
 _OTHER_HOST = re.compile(r"^\s*(?:https?:)?//", re.IGNORECASE)
+# An address of another host that a style sheet loads.
 _IN_CSS = re.compile(r"""(?:url\(\s*|@import\s+)["']?\s*((?:https?:)?//[^"')\s]+)""", re.IGNORECASE)
+# A text in a script that is an address of another host.
 _IN_SCRIPT = re.compile(
     r"""["'`]((?:https?:)?//[a-z0-9-]+\.[a-z0-9.-]+(?:/[^"'`\s]*)?)["'`]""", re.IGNORECASE
 )
+# Beginnings of names of XML namespaces, which look like addresses and are not loaded.
 _NAMESPACES = ("http://www.w3.org/",)
 
 

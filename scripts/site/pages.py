@@ -1,6 +1,6 @@
-"""The generated pages of the documentation site, as Markdown: SDK, command line, metrics, README.
+"""Make the generated pages of the documentation site as Markdown: SDK, command line, metrics, README.
 
-Everything is computed from the sources of one checkout.  Nothing is written, and no extra is needed.
+The pages are computed from the sources of one checkout.  This module writes no files and needs no extra.
 """
 
 from __future__ import annotations
@@ -31,23 +31,26 @@ SDK = {
     "Recordings": ("Dataset", "open_dataset"),
     "Large data": ("DataClient", "DataOptions"),
 }  # fmt: skip
-"""Section -> names of `client_sdk`; public names that stand in no section are put into a section "More"."""
+"""Names of `client_sdk` by section of the SDK page; public names without a section are put into "More"."""
 _MODULES = ("client_sdk.cameras", "rse_pf.geometry", "rse_pf.pnp", "rse_pf.auth.robot_key", "rse_pf.service")
 """Further modules whose public names a robot's program or a service uses."""
+# Modules that define the metrics.
 _METRIC_SOURCES = ("rse_pf/server/metrics.py", "rse_pf/local/control/federation.py")
+# Type of a metric by the class of `prometheus_client` that makes it.
 _FAMILIES = {
     "CounterMetricFamily": "counter",
     "GaugeMetricFamily": "gauge",
     "HistogramMetricFamily": "histogram",
 }
+# A link in Markdown, with its target as the second group.
 _LINK = re.compile(r"(\]\()([^)\s]+)(\))")
 _LISTED = {".py": "python", ".md": "markdown", ".json": "json", ".lua": "lua", ".cpp": "cpp", ".sh": "sh"}
-"""Ending -> language of the files that have a listing: a page of the site with the text of the file."""
-_WIDTH = "96"
+"""Language by ending of the files that have a listing: a page of the site with the text of the file."""
+_WIDTH = "96"  # width in characters of the help pages
 
 
 def generated(root: Path) -> dict[str, str]:
-    """Return the address and the text of each page that no file of ``docs`` holds."""
+    """Return the text of each generated page by its address on the site."""
     return {
         "index.md": moved((root / "README.md").read_text(encoding="utf-8")),
         "contributing.md": moved((root / "CONTRIBUTING.md").read_text(encoding="utf-8")),
@@ -60,7 +63,7 @@ def generated(root: Path) -> dict[str, str]:
 
 
 def moved(text: str) -> str:
-    """Return a page of the root with its links changed as if it stood in ``docs``."""
+    """Return *text*, a page of the repository's root folder, with links that are valid in ``docs``."""
     names = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md", "README.md": "index.md"}
 
     def link(found: re.Match[str]) -> str:
@@ -115,7 +118,7 @@ def inside(root: Path, page: str, text: str) -> str:
 def _outside(root: Path, page: str, link: str) -> str:
     """Return the file or folder outside of ``docs`` to which a link leads, relative to *root*.
 
-    Empty if the link leads to a page of ``docs``, to another host, or to no existing file.
+    The result is empty if the link leads to a page of ``docs``, to another host, or to no existing file.
     """
     target = link.partition("#")[0]
     if not target or "://" in target:
