@@ -4,7 +4,7 @@
 export type Numbers = ArrayLike<number>;
 
 export interface RobotOptions {
-  /** The robot's token, or a function that returns a fresh one within 30 s for each connect and each renewal. */
+  /** The robot's token, or a function that returns a fresh token within 30 s for each connect and each renewal. */
   token?: string | (() => string | Promise<string>);
   /** How the token travels: as a sub-protocol (default), or as a header, which only Node can set. */
   tokenIn?: "protocol" | "header";
@@ -14,7 +14,7 @@ export interface RobotOptions {
   sdk?: string;
   /**
    * Called with `link-lost` or `refused` and the reason, or with `link-back` or `moved` and the name of the server.
-   * A robot that its servers refuse goes on reconnecting. The first connect and `close` are not reported.
+   * A robot that its servers refuse continues to reconnect. The first connect and `close` are not reported.
    */
   onChange?: (what: "link-lost" | "link-back" | "moved" | "refused", why: string) => void;
   /** Longest duration of an attempt, until the Welcome; default 4000. */
@@ -23,7 +23,7 @@ export interface RobotOptions {
   stallTimeoutMs?: number;
   /** Address of the data service, if it is not that of the servers. */
   dataUrl?: string;
-  /** Class of WebSockets, for a runtime without one. */
+  /** Class of WebSockets, for a runtime without a built-in class. */
   WebSocket?: unknown;
 }
 
@@ -32,11 +32,11 @@ export interface CallOptions {
   deadlineMs?: number | null;
   /** Name of the camera or task: the newest command of a stream replaces older ones that wait. */
   stream?: string;
-  /** Answer this command even if newer ones of its stream follow. */
+  /** Answer this command even if newer commands of its stream follow. */
   keep?: boolean;
   /** A word of at most 64 characters that is found in the server's log. */
   trace?: string;
-  /** Called with the progress of a long service: the part that is done (0 to 1), and its step. No default deadline then. */
+  /** Called with the progress of a long service: completed share (0 to 1), current step. No default deadline then. */
   onProgress?: (done: number, what: string) => void;
   /** Cancels the command when it is aborted: the command ends with `cancelled`. */
   signal?: AbortSignal;
@@ -64,7 +64,7 @@ export interface Camera {
 }
 
 export interface PnpRequest {
-  /** Intrinsics of the image, pixels; the first pixel's centre is (0, 0). */
+  /** Intrinsics of the image in pixels; the centre of the first pixel is (0, 0). */
   camera: Camera;
   /** 3n numbers: metres, world frame; n from 4 to 5000. */
   pointsWorld: Numbers;
@@ -85,7 +85,7 @@ export interface PnpRequest {
 export interface PnpReply {
   /** 16 numbers, row-major: maps world points into the camera's frame (x right, y down, z forward). */
   T_camera_world: number[];
-  /** Sorted row numbers. */
+  /** Sorted row numbers of the matches that are inliers. */
   inliers: number[];
   rmse_px: number;
   /** 21 numbers: upper triangle of the covariance of the twist (metres, then radians), left of the pose. */

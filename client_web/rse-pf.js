@@ -6,34 +6,37 @@
  * clock.  Names that begin with `_` are internal, and the minifier may shorten them.
  */
 
-// Attempts of `connect` before it rejects.
+// Number of attempts of `connect` before it rejects.
 const FIRST_ATTEMPTS = 4;
-// Longest attempt to connect after an unanswered one: Chromium then delays a WebSocket by up to 5 s.
+// Time limit of an attempt to connect after an unanswered attempt: Chromium then delays a WebSocket by up to 5 s.
 const LONG_ATTEMPT_MS = 11e3;
-// Time between two pings, and longest wait for a pong.
+// Time between two pings.
 const PING_S = 2;
+// Longest wait for a pong.
 const PONG_S = 3;
 // Default deadline of a command, and time for which a cancelled command counts as unanswered.
 const ANSWER_S = 5;
 // Longest duration of a call of the token function.
 const TOKEN_MS = 3e4;
+// Largest deadline of a command: an hour.
 const MAX_DEADLINE_MS = 3.6e6;
 // Largest message of a server after decompression, and largest JSON text of a command.
 const MAX_INFLATED_BYTES = 1 << 20;
-// Commands wait while the socket holds more unsent bytes than this, so that newer frames can replace them.
+// Number of unsent bytes in the socket above which commands wait, so that newer frames can replace them.
 const MAX_BUFFERED_BYTES = 1 << 16;
-// Largest object that is stored by one PUT, and largest part of an upload.
+// Largest object that is stored by one PUT request; larger objects are uploaded in parts.
 const MAX_PUT_BYTES = 1 << 18;
+// Largest part of an upload.
 const MAX_PART_BYTES = 1 << 20;
-// Undecodable messages after which a connection is closed.
+// Number of undecodable messages of a connection after which it is closed.
 const MAX_BAD_MESSAGES = 10;
 // Largest budget of commands that are sent again after `busy`; each new command adds 0.1 to the budget.
 const MAX_RETRIES = 5;
 // Longest pause of a stream after one `busy` answer.
 const MAX_PAUSE_S = 60;
-// Used part of the server's rate limit: a network may deliver messages closer together than they were sent.
+// Share of the server's rate limit that is used: a network may deliver messages closer together than they were sent.
 const RATE_SHARE = 0.9;
-// The first connect and calls wait for the end of a refusal that ends within this time.
+// Longest remaining time of a refusal for whose end calls and the first connect wait.
 const NEAR_S = 2;
 // Smallest change of the difference of wall clock and monotonic clock that counts as a set clock.
 const CLOCK_SET_S = 0.5;
@@ -173,7 +176,7 @@ const REFUSALS = {
   4409: ["conflict", "another one replaced it", "one token per robot"],
 };
 
-/** Codes of Node for an attempt that reached no server; a browser says only whether it is online. */
+/** Error codes of Node for an attempt that reached no server; a browser reports only whether it is online. */
 const UNREACHABLE = /^E(NET|HOST|AI_|NOTF|TIMED)|^Timeout/;
 const isOnline = () => navigator.onLine;
 
@@ -279,7 +282,7 @@ export const connect = async (url, options = {}) => {
         : [protocol, "rse-pf.token." + used],
       );
     } catch (failed) {
-      // Its message may contain the token.
+      // The message of the exception may contain the token.
       throw refused(makeError(USAGE, "no WebSocket: " + failed.name, "wss: from https pages"));
     }
     link._socket = socket;
@@ -323,7 +326,7 @@ export const connect = async (url, options = {}) => {
     if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
     else if (isRevoked || code === 4401 || (isOpening && isExpired(link._token))) {
       failed = unauthorized();
-      // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
+      // Times in tokens are whole seconds: a fresh token has to be issued in a later second than the cut-off.
       if (isStatic || isRevoked) refused(failed, isStatic ? Infinity : 1);
     } else if (isOpening) failed = await reasonOf(link, failed, isStatic);
     lose(link, failed);
@@ -403,7 +406,7 @@ export const connect = async (url, options = {}) => {
     isKeeping = false;
   };
 
-  /** Record why there is no connection. A refusal that lasts ends all calls, and the robot goes on reconnecting. */
+  /** Record why there is no connection. A refusal that lasts ends all calls, and the robot continues to reconnect. */
   const note = (failed) => {
     trouble = failed;
     if (current || error || !lasts(failed)) return;
@@ -786,7 +789,7 @@ export const connect = async (url, options = {}) => {
         const seq = lane._sent + 1;
         const each = {
           _id: id, _lane: lane, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal, _trace: trace,
-          // Encoded now, so that the caller may change the arrays afterwards.
+          // The payload is encoded now, so that the caller may change its arrays afterwards.
           _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
           _payload: textOf(payload),
           _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
@@ -834,7 +837,7 @@ export const connect = async (url, options = {}) => {
       }),
 
     upload: async (data, { onProgress = nothing, signal } = {}) => {
-      const bytes = bytesOf(data); // a copy: the caller may change its own
+      const bytes = bytesOf(data); // a copy, since the caller may change the original
       const size = bytes.length;
       const digest = await sha256(bytes);
       const path = "uploads/" + digest;

@@ -126,7 +126,7 @@ int main(int argc, char** argv) {
             }
             std::unique_lock lock(mutex);
             changed.wait(lock, [&] { return open == 0; });
-            heap.erase(heap.begin(), heap.begin() + static_cast<std::ptrdiff_t>(heap.size() / 4));  // until it is warm
+            heap.erase(heap.begin(), heap.begin() + static_cast<std::ptrdiff_t>(heap.size() / 4));  // the allocator warms up
             out["memory"] = {{"commands", sent}, {"first_bytes", heap.front()}, {"last_bytes", heap.back()},
                              {"most_bytes", *std::max_element(heap.begin(), heap.end())}, {"seconds", memory_s},
                              {"cpu_us_a_pose", (cpu_s() - cpu_before) / static_cast<double>(sent) * 1e6}};

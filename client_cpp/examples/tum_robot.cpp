@@ -21,7 +21,7 @@ namespace {
 
 using Transform = cv::Matx44d;
 
-const rse_pf::Camera camera{525, 525, 319.5, 239.5, 640, 480};  // the recordings' own suggestion
+const rse_pf::Camera camera{525, 525, 319.5, 239.5, 640, 480};  // the intrinsics that the TUM recordings suggest
 constexpr double depth_units_per_m = 5000;
 
 struct Entry {
@@ -43,7 +43,7 @@ std::vector<Entry> entries(const std::string& path) {
 struct Keyframe {
     std::vector<cv::KeyPoint> points;
     cv::Mat descriptors;
-    std::vector<float> depths_m;  // 0 where there is none
+    std::vector<float> depths_m;  // depth of each feature; 0 for a feature without a depth
     Transform T_world_camera;
 };
 
@@ -142,7 +142,7 @@ int main(int argc, char** argv) {
                     keyframe = keyframe_of(folder, depth->file, points, descriptors);
                     keyframe.T_world_camera = T_world_camera;
                 }
-            } catch (const rse_pf::RsePfError& error) {  // this image has no pose; the next one may have
+            } catch (const rse_pf::RsePfError& error) {  // this image has no pose; the next image may have one
                 ++weak;
                 std::fprintf(stderr, "image %zu: %s\n", i, error.what());
             }

@@ -20,15 +20,17 @@ using json = nlohmann::json;
 
 /// Options of one command.
 struct CallOptions {
-    /// Seconds within which the answer is needed; without it `Options::answer_timeout_s`, or none for a long service.
+    /// Seconds within which the answer is needed. Without a value: `Options::answer_timeout_s`, or no deadline for a long
+    /// service.
     std::optional<double> deadline_s{};
     /// Name of the camera or task; within a stream the newest command wins. Empty: no stream.
     std::string stream{};
     /// Whether this command is answered although newer commands of its stream follow.
     bool keep = false;
-    /// Word of at most 64 characters that the log of the server has beside this command.
+    /// Word of at most 64 characters that the log of the server records with this command.
     std::string trace{};
-    /// Called on the thread of callbacks with the progress of a long service: the part that is done (0 to 1) and its step.
+    /// Called on the thread of callbacks with the progress of a long service: the completed share (0 to 1) and the name of
+    /// the current step.
     std::function<void(double, const std::string&)> on_progress{};
 };
 

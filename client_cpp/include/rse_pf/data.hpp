@@ -1,4 +1,5 @@
-// Objects of the data service: bytes by their sha256 digest, over HTTP. Calls block; use a client in one thread only.
+// Client of the data service: store and load objects (bytes named by their sha256 digest) over HTTP. Calls block; use a
+// client in one thread only.
 #pragma once
 
 #include <algorithm>
@@ -30,7 +31,7 @@ inline std::string sha256(std::string_view bytes) {
 }
 
 struct DataOptions {
-    std::string ca_file{};       ///< file of trusted authorities in PEM; empty: those of the machine
+    std::string ca_file{};       ///< file of trusted authorities in PEM; empty: the authorities of the machine
     double timeout_s = 10;       ///< longest duration of one request
     double deadline_s = 60;      ///< longest duration of a call, with its repeated requests
     std::size_t part_bytes = 1 << 20, max_object_bytes = 256 << 20;
@@ -73,7 +74,7 @@ class DataClient {
         return bytes;
     }
 
-    /// Remove an object; a missing one is no error.
+    /// Remove an object; it is no error if there is no such object.
     void remove(const std::string& digest) { request(Verb::delete_, "/data/v1/objects/" + digest, {}); }
 
   private:

@@ -45,7 +45,7 @@ template <class T> class Outcome {
     bool ok() const noexcept { return state_.index() == 0; }
     explicit operator bool() const noexcept { return ok(); }
 
-    /// Return the value; throws RsePfError if there is none.
+    /// Return the value; throws the RsePfError of the failure if there is no value.
     const T& value() const& {
         if (!ok()) throw RsePfError(std::get<1>(state_));
         return std::get<0>(state_);

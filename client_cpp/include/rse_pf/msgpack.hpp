@@ -1,6 +1,6 @@
 // MessagePack as the sub-protocol rse-pf.v1.bin uses it: a writer of commands and a reader of answers.
 //
-// nlohmann-json reads and writes MessagePack, too, and is used for payloads of any shape. The messages around them, and
+// nlohmann-json also reads and writes MessagePack, and is used for payloads of any shape. The messages around them, and
 // the arrays of `pnp`, are written and read here without a tree of objects. The reader bounds nesting and checks every
 // length, so that malformed input cannot exhaust the stack.
 #pragma once

@@ -12,7 +12,7 @@
 
 namespace rse_pf {
 
-/// Intrinsics of an image; pixels are undistorted, and the centre of the first one is (0, 0).
+/// Intrinsics of an image; pixels are undistorted, and the centre of the first pixel is (0, 0).
 struct Camera {
     double fx = 0, fy = 0, cx = 0, cy = 0;  // px
     std::uint32_t width = 0, height = 0;    // px
@@ -33,9 +33,9 @@ struct DepthNoise {
 struct PnpRequest {
     Camera camera{};
     std::vector<std::array<double, 3>> points_world{};  ///< metres, world frame; 4 to 5,000
-    std::vector<std::array<double, 2>> pixels{};        ///< row i observes point i
+    std::vector<std::array<double, 2>> pixels{};        ///< undistorted, px; row i observes point i
     PnpOptions options{};
-    std::vector<double> depths_m{};  ///< measured at the pixels, 0 where there is none; empty: not used
+    std::vector<double> depths_m{};  ///< depths in metres at the pixels, 0 for a pixel without a depth; empty: no depths
     std::optional<DepthNoise> depth_noise{};
     /// Send numbers as float64; float32 is half the size and moves a pose by less than 0.02 mm.
     bool is_double = false;
@@ -99,7 +99,7 @@ inline std::string encoded(const PnpRequest& request) {
     return out;
 }
 
-/// Return the pose in an answer of `pnp`; throws RsePfError `bad-message` if it holds none.
+/// Return the pose in an answer of `pnp`; throws RsePfError `bad-message` if the answer holds no pose.
 inline PoseAnswer pose_of(const Answer& answer) {
     PoseAnswer pose;
     msgpack::Reader reader(answer.reply_msgpack);

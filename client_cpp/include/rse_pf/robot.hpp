@@ -104,7 +104,7 @@ class Robot {
         });
     }
 
-    /// Cancel a command: it ends as `cancelled`; the server is asked to cancel a long one, too.
+    /// Cancel a command: it ends as `cancelled`; the server is asked to cancel a long command as well.
     void cancel(std::uint64_t id) {
         post([core = core_, id] {
             core->connection->session.cancel(id);
@@ -189,7 +189,8 @@ class Robot {
         return options;
     }
 
-    /// Send a command. *on_end* is called on the thread of the connection; without one, *at_once* is called on this thread.
+    /// Send a command. *on_end* is called on the thread of the connection. If the connection is not running, *at_once* (by
+    /// default *on_end*) is called on this thread, with the failure.
     std::uint64_t submit(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end, OnEnd<Answer> at_once = {}) {
         if (!at_once) at_once = on_end;
         const std::uint64_t id = core_->next_id++;

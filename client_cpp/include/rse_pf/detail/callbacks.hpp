@@ -1,4 +1,4 @@
-// The thread that runs the callbacks of a program, so that none of them can hold up the connection.
+// The thread that runs the callbacks of a program, so that no callback delays the connection.
 #pragma once
 
 #include <condition_variable>
@@ -60,7 +60,7 @@ class Callbacks {
             if (key) newest_.erase(*key);
             lock.unlock();
             call(callback);
-            callback = nullptr;  // destroy it without the lock, too
+            callback = nullptr;  // destroy the callback without the lock as well
             lock.lock();
         }
         thread_ = {};
@@ -79,7 +79,7 @@ class Callbacks {
         ++errors_;
         last_error_ = std::move(error);
     }
-    /// Return how many callbacks threw, and the text of the last exception.
+    /// Return the number of callbacks that threw, and the text of the last exception.
     std::pair<std::uint64_t, std::string> errors() const {
         const std::lock_guard lock(mutex_);
         return {errors_, last_error_};
@@ -89,7 +89,7 @@ class Callbacks {
     mutable std::mutex mutex_;
     std::condition_variable changed_;
     std::deque<std::pair<std::function<void()>, std::optional<Key>>> waiting_;
-    std::map<Key, std::function<void()>*> newest_;  ///< those in `waiting_` that have a key
+    std::map<Key, std::function<void()>*> newest_;  ///< callbacks in `waiting_` that have a key, by key
     std::uint64_t errors_ = 0;
     std::string last_error_;
     std::thread::id thread_;
@@ -105,7 +105,8 @@ std::function<void(Arguments...)> deferred(const std::shared_ptr<Callbacks>& cal
     };
 }
 
-/// Return the same for values of which only the newest is needed; *key_of* returns the key of a value within *id*.
+/// Return a function that queues *callback* for values of which only the newest is needed; *key_of* returns the key of a
+/// value within *id*.
 template <class KeyOf, class... Arguments>
 std::function<void(Arguments...)> newest(const std::shared_ptr<Callbacks>& callbacks, std::function<void(Arguments...)> callback, std::uint64_t id, KeyOf key_of) {
     if (!callback) return {};

@@ -22,9 +22,9 @@ namespace rse_pf {
 /// failed: a later answer of that call is ignored, and the next call does not wait for it.
 using Token = std::variant<std::string, std::function<std::string()>>;
 
-/// Receives what changed: `link-lost` or `refused` and the reason, `link-back` or `moved` and the name of the server. The
-/// first connection is not reported: `Robot::connect` returns or throws. A robot that was connected once reconnects for
-/// ever; `refused` says why its servers refuse it.
+/// Receives a change of the connection: `link-lost` or `refused` and the reason, `link-back` or `moved` and the name of
+/// the server. The first connection is not reported: `Robot::connect` returns or throws. A robot that was connected
+/// once reconnects for ever; `refused` says why its servers refuse it.
 using OnChange = std::function<void(const std::string& what, const std::string& why)>;
 
 /// The address of the platform, and the settings of a robot's connection.
@@ -32,7 +32,7 @@ struct Options {
     std::string url{};             ///< ws://HOST:PORT/ws or wss://HOST/ws
     Token token{};                 ///< a connection with a fixed token is closed when the token expires
     std::string sdk = "rse-pf-cpp/1";  ///< name and version of the program, for the server's log
-    std::string ca_file{};         ///< file of trusted authorities in PEM; empty: those of the machine
+    std::string ca_file{};         ///< file of trusted authorities in PEM; empty: the authorities of the machine
     double connect_timeout_s = 2, reconnect_base_s = 0.1, reconnect_max_s = 1;
     double reconnect_long_max_s = 40;  ///< longest pause between attempts; after a refusal a pause is at least half of this
     double answer_timeout_s = 5;   ///< deadline of a command without `CallOptions::deadline_s`
@@ -42,7 +42,7 @@ struct Options {
 
 namespace detail {
 
-/// Return the refusal that a close code means; a Failure with an empty code if the robot may reconnect at once.
+/// Return the refusal that a WebSocket close code means; a Failure with an empty code if the robot may reconnect at once.
 inline Failure refusal_of(unsigned code, const std::string& reason) {
     const std::string why = reason.empty() ? "" : ": " + reason;
     switch (code) {
@@ -69,10 +69,10 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
     asio::io_context io{1};
     Session session;
-    std::optional<Failure> fatal;    ///< why there will be no further connection: closed, or never connected
+    std::optional<Failure> fatal;    ///< why there will be no further connection: the robot was closed, or never connected
     std::optional<Failure> refusal;  ///< why all servers refuse this robot now
 
-    /// Return why a command cannot be sent, null if it may wait for a connection.
+    /// Return why a command cannot be sent; null if the command may wait for a connection.
     const Failure* reason() const { return fatal ? &*fatal : refusal ? &*refusal : nullptr; }
 
     /// Connect; *on_open* is called once, without a value after the first Welcome, or with the failure.
@@ -128,7 +128,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     /// Longest duration of a TCP handshake. Linux repeats an unanswered SYN after 1, 3 and 7 s; a new attempt is faster.
     static constexpr double tcp_timeout_s = 1;
 
-    /// One WebSocket.
+    /// The state of one WebSocket.
     struct Channel {
         Channel(asio::io_context& io, std::shared_ptr<asio::ssl::context> tls) : ws(io, std::move(tls)), timer(io), lookup_timer(io) {}
         websocket::stream<Transport, false> ws;
@@ -255,7 +255,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         const std::string hint = cause == untrusted_certificate ? "name its authority in ca_file, or in the variable SSL_CERT_FILE" : "is the platform running? is the address right?";
         DialFailure failure{{"connect", "cannot connect to " + address_.shown() + ": " + cause, hint}};
         failure.unanswered = !channel->accepted;
-        // The addresses are tried one after the other: the next attempt begins with another one.
+        // The addresses are tried one after the other: the next attempt begins with another address.
         if (failure.unanswered && known_.size() > 1) std::rotate(known_.begin(), known_.begin() + 1, known_.end());
         dial_failed(failure);
         return true;
@@ -440,7 +440,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (code == 4401 && !has_token_function() && channel->token == token_) {
             ends.failure = {"unauthorized", "the token has expired", "set options.token to a function, or call renew in time"};
         }
-        // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
+        // Times in tokens are whole seconds: a fresh token has to be issued in a later second than the cut-off.
         if (code == 4403 && has_token_function()) ends.valid_from = wall_s() + 1;
         if (!ends.failure.code.empty() && (was_dialing || was_current)) {
             ends.is_refusal = ends.refuses_any = true;

@@ -1,4 +1,4 @@
-// Decode unsuccessful HTTP answers, to a handshake or of the data service.
+// Decode unsuccessful HTTP answers: those to a WebSocket handshake, and those of the data service.
 #pragma once
 
 #include <algorithm>
@@ -16,7 +16,7 @@ namespace rse_pf::detail {
 inline double now_s() {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
-/// Unix seconds by the clock with which a robot signs its tokens. The clock may be wrong, and may be set.
+/// Return Unix seconds of the wall clock, with which a robot signs its tokens. The clock may be wrong, and may be set.
 inline double wall_s() {
     return std::chrono::duration<double>(std::chrono::system_clock::now().time_since_epoch()).count();
 }
@@ -25,10 +25,10 @@ inline double wall_s() {
 struct DialFailure {
     Failure failure;
     double after_s = 0;
-    bool is_refusal = false;     // a server refuses this robot, maybe for long
-    bool wrong_address = false;  // ends the first connect
+    bool is_refusal = false;     // a server refuses this robot, possibly for a long time
+    bool wrong_address = false;  // the address is no RSE-PF server: the first `connect` fails at once
     bool unanswered = false;     // no host accepted the TCP connection
-    bool refuses_any = false;    // a fresh token would be refused, too
+    bool refuses_any = false;    // the server would refuse a fresh token as well
     std::optional<double> valid_from{};  // Unix time from which tokens are accepted
 };
 

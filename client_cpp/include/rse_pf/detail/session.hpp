@@ -18,7 +18,7 @@
 
 namespace rse_pf {
 
-/// Counters of one robot since it was made.
+/// Counters of one robot since its construction.
 struct Stats {
     std::uint64_t sent = 0, answered = 0, failed = 0, resent = 0, reconnects = 0, moves = 0;
     std::uint64_t dropped_answers = 0;      ///< answers to commands that had ended already
@@ -92,7 +92,7 @@ class Session {
         }
     }
 
-    /// Queue a command; it is sent as soon as there is a connection whose limits allow it.
+    /// Queue a command, which is sent as soon as there is a connection whose limits allow it.
     void submit(Command command, double now) {
         ++stats.sent;
         const auto& options = command.options;
@@ -121,7 +121,7 @@ class Session {
         flush(now);
     }
 
-    /// Cancel a command: it ends as `cancelled`; the server is asked to cancel a long one, too.
+    /// Cancel a command: it ends as `cancelled`; the server is asked to cancel a long command as well.
     void cancel(std::uint64_t id) {
         const auto found = pending_.find(id);
         if (found == pending_.end() || found->second.cancelled) return;
@@ -161,7 +161,7 @@ class Session {
         busy_.clear();
         if (before && before != link) {
             before->leaving = true;
-            for (auto& [id, pending] : pending_) {  // a job goes on at any server
+            for (auto& [id, pending] : pending_) {  // a job continues on any server
                 if (pending.link == before && pending.is_long && !pending.cancelled) detach(id, pending);
             }
         }
@@ -317,7 +317,7 @@ class Session {
         OnUpdate on_update;
         OnSubscriptionEnd on_end;
     };
-    /// The end of the pause of a stream, and the `busy` answer that began it.
+    /// The pause of a stream: its end (seconds), and the `busy` answer that began it.
     struct Busy {
         double until = 0;
         Failure failure{};
@@ -536,7 +536,7 @@ class Session {
     std::set<std::uint64_t> waiting_;
     std::map<std::uint64_t, Subscription> subscriptions_;
     std::unordered_map<std::string, std::uint64_t> sequence_, delivered_;
-    std::unordered_map<std::string, Busy> busy_;  // of streams, on this connection
+    std::unordered_map<std::string, Busy> busy_;  // pauses of streams on this connection, by stream
     double retries_ = max_retries, next_deadline_ = never, next_retry_ = never;
 };
 

@@ -65,7 +65,7 @@ class ClockOffset {
     std::deque<Exchange> last_;
 };
 
-/// When to send a fresh token: after 80 % of the time that is left, then after half of the rest.
+/// Compute when to send a fresh token: after 80 % of the time that is left, then after half of the rest.
 class RenewalTimer {
   public:
     void expires_in(double token_s, double now) {

@@ -64,9 +64,9 @@ inline Address address_of(const std::string& url) {
     return out;
 }
 
-/// Authorities whose certificates are trusted; by default those of the machine.
+/// Authorities whose certificates are trusted; by default the authorities of the machine.
 struct Trust {
-    /// File of authorities in PEM, instead of the machine's.
+    /// File of authorities in PEM, which replace those of the machine.
     std::string ca_file{};
 };
 
@@ -170,7 +170,7 @@ class Transport {
     std::unique_ptr<asio::ssl::stream<Socket&>> stream_;
 };
 
-// What Beast calls at the end of a WebSocket; found by argument-dependent lookup.
+// Functions that Beast calls at the end of a WebSocket, and finds by argument-dependent lookup.
 inline void teardown(beast::role_type, Transport& transport, error_code& error) {
     transport.close();
     error = {};
