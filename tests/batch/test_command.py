@@ -77,10 +77,10 @@ def test_the_same_command_continues_after_a_kill(store: Path) -> None:
     kept = links_in(store)
 
     second = begun(store)
-    told, errors = second.communicate(timeout=100)
+    reported, errors = second.communicate(timeout=100)
 
     assert second.returncode == 0, errors
-    answer = json.loads(told)
+    answer = json.loads(reported)
     assert answer["joined"] == ["a", "b"]
     assert answer["parts"]["found"] >= kept >= 3
     assert MapRegistry(DirectoryStore(store)).head("hall").keyframes == 26

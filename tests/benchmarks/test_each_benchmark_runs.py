@@ -1,6 +1,6 @@
 """Each benchmark runs for some seconds and reports its figures, so that none breaks unseen.
 
-Such a run measures nothing: with ``--short`` only the bars are judged that neither time nor load can miss.
+Such a run measures nothing: with ``--short`` only the bars are checked that neither time nor load can miss.
 """
 
 from __future__ import annotations
@@ -116,13 +116,13 @@ def test_no_pose_is_in_a_room_that_looks_the_same(tmp_path: Path) -> None:
     assert figure_of(report, "figures.rooms.one_lens.jumps") == 0
 
 
-def test_the_server_of_the_paper_is_measured_beside_ours(tmp_path: Path) -> None:
+def test_the_server_of_the_paper_is_compared_with_ours(tmp_path: Path) -> None:
     """Skipped where nginx, its Lua or the sources of the paper's server are missing."""
     sources = REPOSITORY.parent / "shared" / "tools" / "peer"
 
     report = run("server.peer", [str(sources), "--rounds", "1", "--seconds", "0.5"], tmp_path)
 
-    assert figure_of(report, "figures.judged.bin 30 % 1.cpu_ratio") > 0
+    assert figure_of(report, "figures.compared.bin 30 % 1.cpu_ratio") > 0
 
 
 def test_each_benchmark_is_tried_here() -> None:

@@ -108,8 +108,8 @@ def test_the_body_is_compared_where_its_place_beside_the_camera_is_known():
 
     assert of_camera.ate_m == pytest.approx(0.0, abs=1e-9)
     assert of_body.ate_m > 0.005
-    told = trajectory_figures(estimate, truth, T_body_camera)["ate_cm"]
-    assert told == pytest.approx(100 * of_body.ate_m, abs=1e-3)
+    reported = trajectory_figures(estimate, truth, T_body_camera)["ate_cm"]
+    assert reported == pytest.approx(100 * of_body.ate_m, abs=1e-3)
     assert trajectory_figures(estimate, truth)["ate_cm"] == pytest.approx(0.0, abs=1e-3)
     scaled = Trajectory(stamps_s, screw(stamps_s))
     scaled.T_world_camera[:, :3, 3] *= 3.0

@@ -35,7 +35,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 FRAMES = 12
 ANSWERS = 8
 HOLD = 10
-"""So many frames of the film show the same tag: a camera of 10 frames a second."""
+"""Number of successive frames of the film that show the same tag: a camera of 10 frames a second."""
 with socket.create_server(("127.0.0.1", 0)) as _free:
     PORT = _free.getsockname()[1]
 ALLOWED_ORIGINS = f"http://localhost:{PORT}"

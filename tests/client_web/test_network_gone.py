@@ -1,4 +1,4 @@
-"""When the web client dials while the network is gone: what a page knows of it, and what Node is told."""
+"""When the web client reconnects while the network is gone: in a page, and in Node."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ const nextDial = (withinS) => new Promise((resolve) => {
 const lose = async (fail, options = {}) => {
   await connect("ws://a.invalid/ws", { codec: "json", WebSocket: socketThat(fail), ...options });
   const now = performance.now.bind(performance);
-  performance.now = () => now() + 11e3; // it was connected for so long that its attempts are counted anew
+  performance.now = () => now() + 11e3; // it was connected for so long that it counts attempts from 0 again
   isThere = false;
   dials[0].onclose({ code: 1006 });
 };

@@ -1,4 +1,4 @@
-"""The web client keeps to what a server with too much to do tells it, and says so."""
+"""The web client waits as an overloaded server demands, and reports that."""
 
 from __future__ import annotations
 

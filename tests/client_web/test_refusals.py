@@ -1,4 +1,4 @@
-"""The web client tells a refusal of a server from one of whatever stands between."""
+"""The web client distinguishes the refusal of a server from that of a firewall or proxy."""
 
 from __future__ import annotations
 

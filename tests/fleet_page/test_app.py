@@ -52,8 +52,8 @@ class Page:
     ) -> tuple[int, dict[str, str], bytes]:
         sent, data = asyncio.run(self.sent(method, target, body, headers))
         start = sent[0]
-        told = {name.decode(): value.decode() for name, value in start["headers"]}
-        return start["status"], told, data
+        reported = {name.decode(): value.decode() for name, value in start["headers"]}
+        return start["status"], reported, data
 
     async def sent(
         self, method: str, target: str, body: Any, headers: Mapping[str, str] | None

@@ -30,7 +30,7 @@ def entry(action: str, subject: str, actor: str = "server-1", **detail: Any) -> 
 
 
 @pytest.mark.parametrize(
-    ("told", "sentence"),
+    ("reported", "sentence"),
     [
         (
             entry("auth.accepted", "lab/robot-1", source="192.0.2.2", token="ab", key="k"),
@@ -74,8 +74,8 @@ def entry(action: str, subject: str, actor: str = "server-1", **detail: Any) -> 
         ),
     ],
 )
-def test_an_entry_is_reported_in_words_with_the_tenant_and_the_user(told: Entry, sentence: str) -> None:
-    assert audit_sentence("server-1", told) == sentence
+def test_an_entry_is_reported_in_words_with_the_tenant_and_the_user(reported: Entry, sentence: str) -> None:
+    assert audit_sentence("server-1", reported) == sentence
 
 
 def test_entries_of_all_logs_are_shown_once_in_their_order_without_lines_that_are_none(
@@ -89,9 +89,9 @@ def test_entries_of_all_logs_are_shown_once_in_their_order_without_lines_that_ar
     operator.add("token.issued", "a", time=2.0, user="ada")
     with server.file.open("ab") as opened:
         opened.write(b'{"time":1,"act\n')
-    told, events = rows.new_rows()
+    reported, events = rows.new_rows()
 
-    assert [(row["kind"], row["group"], row["server"]) for row in told] == [
+    assert [(row["kind"], row["group"], row["server"]) for row in reported] == [
         ("token.issued", "audit", "operator"),
         ("auth.accepted", "audit", "server-1"),
     ]

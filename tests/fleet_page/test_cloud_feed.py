@@ -50,25 +50,30 @@ def test_the_boxes_show_what_aws_knows_and_say_what_it_does_not() -> None:
     second = dataclasses.replace(HEALTHY, name="i-2")
     numbers = metrics((20.0,), **{"i-1": {"robots": 7.0, "cpu_percent": 31.25}})
 
-    told = cloud_document(overview(HEALTHY, second), numbers, SETTINGS, time_s=NOW_S, region="r")
+    reported = cloud_document(overview(HEALTHY, second), numbers, SETTINGS, time_s=NOW_S, region="r")
 
-    assert [(each["name"], each["robots"], each["cpu_percent"]) for each in told["servers"]] == [
+    assert [(each["name"], each["robots"], each["cpu_percent"]) for each in reported["servers"]] == [
         ("i-1", 7, 31.2), ("i-2", None, None),
     ]  # fmt: skip
-    assert [each["age_s"] for each in told["servers"]] == [90.0, None]
-    assert (told["robots"], told["requests"], told["percentiles"], told["bytes_in"]) == (7, 10.0, {}, None)
-    assert (told["tls"], told["balancer"], told["url"]) == (True, True, "lb.example")
-    assert told["unknown"][0] == "1 of 2 servers did not report their robots"
-    assert json.loads(json.dumps(told)) == told
+    assert [each["age_s"] for each in reported["servers"]] == [90.0, None]
+    assert (reported["robots"], reported["requests"], reported["percentiles"], reported["bytes_in"]) == (
+        7,
+        10.0,
+        {},
+        None,
+    )
+    assert (reported["tls"], reported["balancer"], reported["url"]) == (True, True, "lb.example")
+    assert reported["unknown"][0] == "1 of 2 servers did not report their robots"
+    assert json.loads(json.dumps(reported)) == reported
 
 
 def test_an_alarm_and_a_missing_server_are_reported_with_the_runbook() -> None:
     alarmed = overview(HEALTHY, wanted=2, alarms={"silent": "ALARM"}, reasons={"silent": "no data\x1b"})
 
-    told = cloud_document(alarmed, metrics((30.0,)), SETTINGS, time_s=NOW_S)["waiting"]
+    reported = cloud_document(alarmed, metrics((30.0,)), SETTINGS, time_s=NOW_S)["waiting"]
 
-    assert told[0] == "the group wants 2 servers and has 1"
-    assert told[-1] == r"alarm silent is in state ALARM: no data\x1b (docs/operations.md#silent)"
+    assert reported[0] == "the group wants 2 servers and has 1"
+    assert reported[-1] == r"alarm silent is in state ALARM: no data\x1b (docs/operations.md#silent)"
 
 
 class Refusing(Account):
@@ -121,20 +126,20 @@ def problems_in(newest: dict[str, Any]) -> list[str]:
 
 
 def test_credentials_that_expire_are_reported_on_the_page_and_end_nothing() -> None:
-    told = told_by_a_feed(Refusing("ap-northeast-2"))
+    reported = told_by_a_feed(Refusing("ap-northeast-2"))
 
     refused = "AWS refuses autoscaling describe_auto_scaling_groups: ExpiredToken (sign in again)"
-    assert (told["link"]["connected"], told["link"]["text"]) == (False, refused)
-    assert [each["name"] for each in told["fleet"]["servers"]] == ["i-1"]
+    assert (reported["link"]["connected"], reported["link"]["text"]) == (False, refused)
+    assert [each["name"] for each in reported["fleet"]["servers"]] == ["i-1"]
 
 
 def test_wrong_credentials_are_an_error_before_a_page_is_served() -> None:
-    with pytest.raises(ConfigurationError, match="ExpiredToken") as told:
+    with pytest.raises(ConfigurationError, match="ExpiredToken") as reported:
         serve_cloud_page(
             Refusing("ap-northeast-2"), SETTINGS, port=0,
             ready=lambda url: pytest.fail("it was served"),
         )  # fmt: skip
-    assert told.value.hint == "sign in again"
+    assert reported.value.hint == "sign in again"
 
 
 def test_the_page_of_the_cloud_changes_nothing() -> None:

@@ -34,12 +34,12 @@ def test_every_text_of_the_fleet_is_escaped() -> None:
         "policy": {"elastic": True, "last_action": {"reason": "a\nb"}},
     }  # fmt: skip
 
-    told = fleet_document(state, PlatformSettings(), time_s=1.0)
+    reported = fleet_document(state, PlatformSettings(), time_s=1.0)
 
-    assert told["platform"] == r"p\x1b"
-    assert told["servers"][0]["name"] == r"<b>\u202e"
-    assert told["last_action"] == r"a\nb"
-    assert json.loads(json.dumps(told)) == told
+    assert reported["platform"] == r"p\x1b"
+    assert reported["servers"][0]["name"] == r"<b>\u202e"
+    assert reported["last_action"] == r"a\nb"
+    assert json.loads(json.dumps(reported)) == reported
 
 
 def test_the_path_of_a_robot_has_a_part_for_each_segment_and_no_line_break_in_its_name() -> None:
@@ -50,14 +50,14 @@ def test_the_path_of_a_robot_has_a_part_for_each_segment_and_no_line_break_in_it
         {"robot": "a\n", "points": points[:1]},
     ]
 
-    told = histories(paths)
+    reported = histories(paths)
 
-    assert told[r"a\n"] == {
+    assert reported[r"a\n"] == {
         "kind": "history",
         "robot": r"a\n",
         "parts": [points.tolist(), points[:1].tolist()],
     }
-    assert told["b"]["parts"] == [points[:1].tolist()]
+    assert reported["b"]["parts"] == [points[:1].tolist()]
 
 
 def test_answer_times_are_known_after_two_readings_that_nobody_asked_for(
@@ -71,13 +71,13 @@ def test_answer_times_are_known_after_two_readings_that_nobody_asked_for(
         return ["server-1"], [f"{row} {next(counts)}\n".encode()]
 
     monkeypatch.setattr(feed, "_ask_servers", ask)
-    told = []
+    reported = []
     for _ in range(3):
         asyncio.run(feed._read_metrics())
-        told.append((feed._percentiles["count"], feed._percentiles["covered_s"]))
+        reported.append((feed._percentiles["count"], feed._percentiles["covered_s"]))
 
     assert hub.pages == 0
-    assert told == [(0, 0.0), (400, 1.0), (2400, 6.0)]
+    assert reported == [(0, 0.0), (400, 1.0), (2400, 6.0)]
 
 
 def test_a_map_is_packed_within_a_fraction_of_a_millimetre_and_its_first_points_are_a_sample(
@@ -97,20 +97,20 @@ def test_a_map_is_packed_within_a_fraction_of_a_millimetre_and_its_first_points_
     data = clouds.packer("")(encode_map(MapVersion(keyframes=(keyframe,), points=points, colours=colours)))
 
     length = int.from_bytes(data[:4], "little")
-    told = json.loads(data[4 : 4 + length])
+    reported = json.loads(data[4 : 4 + length])
     blocks, at = [], 4 + length
     for count in (400, 400, 200):
         numbers = np.frombuffer(data, "<u2", 3 * count, at).reshape(-1, 3)
         shades = np.frombuffer(data, "u1", 3 * count, at + 6 * count).reshape(-1, 3)
-        blocks.append((np.array(told["low"]) + numbers * np.array(told["step"]), shades))
+        blocks.append((np.array(reported["low"]) + numbers * np.array(reported["step"]), shades))
         at += 9 * count
     back, shades = (np.concatenate(each) for each in zip(*blocks, strict=True))
     order = np.argsort(back[:, 0])
-    assert (told["points"], told["block"], at) == (1000, 400, len(data))
+    assert (reported["points"], reported["block"], at) == (1000, 400, len(data))
     assert np.abs(back[order] - points).max() < 2e-4
     assert np.abs(shades[order].astype(int) - colours).max() <= 1
     assert np.abs(np.quantile(blocks[0][0][:, 0], [0.25, 0.5, 0.75]) - [-2.5, 0.0, 2.5]).max() < 0.6
-    assert told["robots"] == {r"a\x1b": [[0.0, 0.0, 0.0]]}
+    assert reported["robots"] == {r"a\x1b": [[0.0, 0.0, 0.0]]}
 
 
 async def test_the_cloud_that_a_page_shows_first_is_packed_once_and_before_it_is_asked_for(

@@ -1,4 +1,4 @@
-"""What browsers are told is bounded: pages, what waits for a slow one, and what a text may contain."""
+"""The data for browsers is bounded: pages, messages that wait for a slow page, and the content of texts."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rse_pf.extensions.fleet_page.hub import Hub
 ALL = frozenset(("fleet", "event"))
 
 
-def told(message: bytes) -> Any:
+def reported(message: bytes) -> Any:
     return json.loads(message.removeprefix(b"data: "))
 
 
 async def next_of(messages: AsyncGenerator[bytes, None], count: int) -> list[Any]:
-    return [told(await asyncio.wait_for(messages.__anext__(), 5.0)) for _ in range(count)]
+    return [reported(await asyncio.wait_for(messages.__anext__(), 5.0)) for _ in range(count)]
 
 
 async def test_a_page_that_does_not_read_gets_the_newest_value_only() -> None:
@@ -49,4 +49,4 @@ async def test_no_text_ends_a_message(name: str) -> None:
     assert message.endswith(b"\n\n")
     assert b"\n" not in message[:-2]
     assert b"\r" not in message
-    assert told(message)["value"]["text"] == name
+    assert reported(message)["value"]["text"] == name

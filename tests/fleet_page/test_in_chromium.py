@@ -63,11 +63,11 @@ class Running:
                 ],
                 stdout=log, stderr=log, env=self.environment,
             )  # fmt: skip
-        self.first_url = self.told(r"fleet page +(\S+)", 90.0)
+        self.first_url = self.reported(r"fleet page +(\S+)", 90.0)
 
     program = (sys.executable, "-m", "rse_pf.cli.main")
 
-    def told(self, pattern: str, within_s: float) -> str:
+    def reported(self, pattern: str, within_s: float) -> str:
         end = time.monotonic() + within_s
         while time.monotonic() < end and self.process.poll() is None:
             found = re.search(pattern, self.log.read_text("utf-8"))
@@ -432,7 +432,7 @@ def test_a_map_of_a_million_points_and_the_replay_of_a_weak_pose_are_shown(
 ) -> None:
     objects = running.folder / "rse-pf" / _NAME / "objects"
     subprocess.run([sys.executable, "-c", MAKE_MAP, str(objects), str(_POINTS)], check=True, timeout=120)
-    address = running.told(r"robots connect to +(\S+)", 1.0)
+    address = running.reported(r"robots connect to +(\S+)", 1.0)
     token = running.run("token", "issue", "robot-1").split()[-1]
     subprocess.run(
         [sys.executable, "-c", BAD_POSES, address, token], check=True, timeout=60, env=running.environment

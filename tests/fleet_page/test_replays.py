@@ -15,11 +15,11 @@ def test_a_weak_pose_shows_its_matches_and_the_rules_that_it_broke(tmp_path: Pat
     made = Made(tmp_path / "rec")
     name = made.send(make_problem(seed=9, n=60, outlier_ratio=0.8))
 
-    told = replay_document(run.report(made.close(), PlatformSettings(), name))
+    reported = replay_document(run.report(made.close(), PlatformSettings(), name))
 
-    assert told["equal"]
-    assert told["picture"].startswith("data:image/png;base64,")
-    broken = [line for line in told["lines"] if ", not at " in line]
+    assert reported["equal"]
+    assert reported["picture"].startswith("data:image/png;base64,")
+    broken = [line for line in reported["lines"] if ", not at " in line]
     assert [line.partition(":")[0] for line in broken] == ["low-inlier-ratio"]
-    assert not any(" ," in line for line in told["lines"])
-    assert told["lines"][0].startswith("verdict weak: low-inlier-ratio; engine ")
+    assert not any(" ," in line for line in reported["lines"])
+    assert reported["lines"][0].startswith("verdict weak: low-inlier-ratio; engine ")

@@ -15,11 +15,11 @@ PERIOD_S = SETTINGS.period_s
 
 
 def policy(*samples: tuple[float, float], **more: object) -> dict[str, object]:
-    told = [
+    reported = [
         {"start_s": number * PERIOD_S, "cpu_percent": cpu, "requests": requests}
         for number, (cpu, requests) in enumerate(samples)
     ]
-    return {"elastic": True, "samples": told, "min_servers": 1, "max_servers": 8, **more}
+    return {"elastic": True, "samples": reported, "min_servers": 1, "max_servers": 8, **more}
 
 
 def test_the_sentence_announces_what_the_policy_decides() -> None:

@@ -91,7 +91,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/system/boot/imds.py", "Secret Keyword"): "made for moto",
     ("tests/recording/test_redact.py", "JSON Web Token"): "made up, to be kept out of a recording",
     ("tests/recording/test_redact.py", "Secret Keyword"): "the same",
-    ("tests/recording/test_told_content.py", "JSON Web Token"): "the same",
+    ("tests/recording/test_decoded_content.py", "JSON Web Token"): "the same",
     ("tests/recording/replay/test_case.py", "Secret Keyword"): "a name, to be kept out of a case",
     (
         "rse_pf/extensions/fleet_page/static/vendor/vendored.json",

@@ -118,11 +118,11 @@ def test_a_share_that_is_none_is_refused(family: ProcessMark, percent: float) ->
 
 
 def test_names_and_ports_reach_nft_only_as_letters_and_numbers() -> None:
-    told = nft_commands('rse_pf_a; "b"', [8001, 0, 8002])
+    reported = nft_commands('rse_pf_a; "b"', [8001, 0, 8002])
 
-    assert "table inet rse_pf_a___b_ " in told
-    assert "dport { 8001, 8002 } drop" in told
-    assert "flags owner" in told
+    assert "table inet rse_pf_a___b_ " in reported
+    assert "dport { 8001, 8002 } drop" in reported
+    assert "flags owner" in reported
 
 
 def test_a_partition_by_a_plain_user_names_the_nearest_thing(monkeypatch: pytest.MonkeyPatch) -> None:

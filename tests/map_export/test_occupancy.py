@@ -164,12 +164,12 @@ def test_the_file_names_the_static_transform_of_ros() -> None:
     )
 
     words = command.split()
-    told = {
+    reported = {
         name: float(words[words.index(f"--{name}") + 1]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")
     }
-    turn = from_quaternion([told[name] for name in ("qx", "qy", "qz", "qw")])
+    turn = from_quaternion([reported[name] for name in ("qx", "qy", "qz", "qw")])
     np.testing.assert_allclose(turn, T_grid_world[:3, :3], atol=1e-6)
-    np.testing.assert_allclose([told[name] for name in "xyz"], T_grid_world[:3, 3], atol=1e-6)
+    np.testing.assert_allclose([reported[name] for name in "xyz"], T_grid_world[:3, 3], atol=1e-6)
     assert command.endswith("--frame-id plan --child-frame-id map")
 
 

@@ -1,4 +1,4 @@
-"""A recorder that ended is followed by another one, a bounded number of times, and workers go on with it."""
+"""A recorder that exited is replaced, a bounded number of times, and workers continue with the new one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DEADLINE_S = 10.0
 
 
 class FakeProcess:
-    """A recorder that ends when it is told to."""
+    """A recorder that ends when it is reported to."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid

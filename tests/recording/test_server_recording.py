@@ -148,7 +148,7 @@ def test_a_recording_that_was_killed_opens_and_lacks_at_most_the_last_second(tmp
             killed_s = time.time()
             if victim == "recorder":
                 os.kill(recorder, signal.SIGKILL)
-                for _ in range(5):  # robots go on
+                for _ in range(5):  # robots continue
                     await robot.solve_pnp(PROBLEM.points_world, PROBLEM.pixels, PROBLEM.camera)
             else:
                 server.stop()

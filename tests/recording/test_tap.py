@@ -22,7 +22,7 @@ ROBOT = RobotId("default", "robot-1")
 
 
 class Loop:
-    """Calls what is due when it is told to."""
+    """Calls what is due when it is reported to."""
 
     def __init__(self) -> None:
         self.due: list[Callable[[], None]] = []
@@ -78,8 +78,8 @@ def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[in
 
 
 def test_a_recorder_that_died_is_reported_once_and_everything_goes_on(pipe: tuple[int, int]):
-    loop, told = Loop(), list[str]()
-    tap = RecordingTap(pipe[1], call_later=loop.call_later, on_dead=lambda: told.append("dead"))
+    loop, reported = Loop(), list[str]()
+    tap = RecordingTap(pipe[1], call_later=loop.call_later, on_dead=lambda: reported.append("dead"))
     number = tap.open_connection("bin", ROBOT)
     tap.observe_received(number, b"x")
     os.close(pipe[0])
@@ -89,5 +89,5 @@ def test_a_recorder_that_died_is_reported_once_and_everything_goes_on(pipe: tupl
         tap.observe_sent(number, b"x")
         loop.turn()
 
-    assert told == ["dead"]
+    assert reported == ["dead"]
     assert (tap.is_dead, tap.dropped, loop.due) == (True, 4, [])

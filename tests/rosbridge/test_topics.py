@@ -185,7 +185,7 @@ async def test_a_tenant_has_a_bounded_number_of_topics_and_latched_bytes(
         assert await code(client, publish("x" * 500, "/t2", latch=True)) is None
         assert await code(client, publish("x" * 600, "/t1", latch=True)) == "quota"
         await other.send(subscribe("/t1"), publish(1, "/t1"))
-        assert await other.data() == [1], "known topics go on"
+        assert await other.data() == [1], "known topics continue"
 
 
 async def test_a_client_that_left_is_held_by_nothing(server: GuardedServer) -> None:

@@ -51,7 +51,7 @@ def test_one_pass_decompresses_a_bounded_multiple_of_the_bag(
     with open_bag_file(path) as file:
         monkeypatch.setattr(decompression, "_FREE_BYTES", 5 << 20)
         monkeypatch.setattr(decompression, "_EXTRA_BYTES_PER_BAG_BYTE", 1)
-        for _ in range(3):  # each pass begins anew
+        for _ in range(3):  # each pass has the whole allowance again
             file._reader.current_chunk = (-1, io.BytesIO())
             assert len(list(file.messages([TOPIC]))) == 1
         monkeypatch.setattr(decompression, "_FREE_BYTES", (4 << 20) - size_bytes)

@@ -205,7 +205,7 @@ def test_a_depth_camera_beside_the_colours_is_registered_by_tf_static(tmp_path: 
     depth = np.full((HEIGHT, WIDTH), 1000, np.uint16)
     depth[20:24, 30:34] = 500
 
-    def beside(w: BagWriter, messages: list[Message]) -> list[Message]:
+    def second_camera(w: BagWriter, messages: list[Message]) -> list[Message]:
         colour = next(each for each in messages if each[0] == COLOUR)
         s = stamp_of(0)
         return [
@@ -216,7 +216,7 @@ def test_a_depth_camera_beside_the_colours_is_registered_by_tf_static(tmp_path: 
             ("/camera/depth/image_raw", IMAGE, s, raw_image(w, s, depth, "16UC1", frame="depth_eye")),
         ]
 
-    with open_bag(write_bag(tmp_path, change=beside)) as bag:
+    with open_bag(write_bag(tmp_path, change=second_camera)) as bag:
         (frame,) = bag
     expected = np.full((HEIGHT, WIDTH), 1.0, np.float32)
     expected[:, WIDTH - 6 :] = 0.0

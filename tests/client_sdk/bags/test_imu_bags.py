@@ -1,4 +1,4 @@
-"""The IMU of a bag: its samples on the frames, placed by tf or a rig; one that cannot be used is told."""
+"""The IMU of a bag: its samples on the frames, placed by tf or a rig; an unusable IMU is reported."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def zooming(w: BagWriter, stamp: int, row: int) -> Any:
 
 
 def recorded_by_realsense(w: BagWriter) -> list[Message]:
-    """Frames as librealsense records them: all of frame "0", depth beside the colours, units of 0.25 mm."""
+    """Frames as librealsense records them: all of frame "0", unregistered depth, units of 0.25 mm."""
     shown, found = scene(), []
     colour, depth = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
     turn = w.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)

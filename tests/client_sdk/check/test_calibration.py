@@ -76,10 +76,10 @@ def test_both_focal_lengths_are_corrected_where_both_are_wrong_alike(
     assert errors.with_the_other([0]) == rows
 
 
-def test_a_drive_that_does_not_turn_cannot_tell_the_focal_length_and_says_so() -> None:
-    told = {each.kind: each for each in judged(Made(turn=0.02, roll=0.02)).cannot_tell}
+def test_a_drive_that_does_not_turn_does_not_determine_the_focal_length() -> None:
+    reported = {each.kind: each for each in judged(Made(turn=0.02, roll=0.02)).cannot_tell}
 
-    focal = told[FaultKind.FOCAL_LENGTH]
+    focal = reported[FaultKind.FOCAL_LENGTH]
     assert "turns by" in focal.reason
     assert "vertical axis" in focal.reason
     assert focal.within is not None
@@ -87,7 +87,7 @@ def test_a_drive_that_does_not_turn_cannot_tell_the_focal_length_and_says_so() -
     assert not judged(Made()).cannot_tell
 
 
-def test_a_drive_of_few_views_cannot_tell_anything_and_does_not_fail() -> None:
+def test_a_drive_of_few_views_determines_nothing_and_does_not_fail() -> None:
     for store in (KeyframeStore(), make_store(Made(views=3))):
         checked = check_calibration(store)
 

@@ -1,4 +1,4 @@
-"""Findings of a drive: which are told, in which order, and what a report holds."""
+"""Findings of a drive: which are reported, in which order, and the content of a report."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ def test_a_report_says_what_is_wrong_and_what_to_do() -> None:
     assert check_lines(report.to_dict()) == [
         "check: half of it is blurred; it bends the path by about 10.0 cm; hold still"
     ]
-    (told,) = json.loads(json.dumps(report.to_dict()))["findings"]
+    (reported,) = json.loads(json.dumps(report.to_dict()))["findings"]
     assert {
         "kind": "blur",
         "value": 0.5,
         "deviation": 0.05,
         "cost": 0.1,
         "fix": "hold still",
-    }.items() <= told.items()
-    assert told["correction"] == {"fx": 525.0}
+    }.items() <= reported.items()
+    assert reported["correction"] == {"fx": 525.0}
 
 
-def test_a_report_without_findings_names_what_the_drive_cannot_tell() -> None:
-    untold = CannotTell(FaultKind.FOCAL_LENGTH, "no turn about the vertical axis: within 6 %", 0.06)
-    report = CheckReport(cannot_tell=(untold,), frames=30)
+def test_a_report_without_findings_names_the_undetermined_faults() -> None:
+    undetermined = CannotTell(FaultKind.FOCAL_LENGTH, "no turn about the vertical axis: within 6 %", 0.06)
+    report = CheckReport(cannot_tell=(undetermined,), frames=30)
 
     assert check_lines(report.to_dict()) == [
         "check: nothing wrong found in 30 frames; this drive does not determine focal_length"

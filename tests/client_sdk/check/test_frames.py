@@ -142,7 +142,7 @@ def test_of_frames_that_were_left_out_on_purpose_no_gap_is_reported() -> None:
     for row, image in enumerate(images()):
         statistics.add((row + row // 2) / 30.0, image)
 
-    findings, untold = statistics.findings()
+    findings, undetermined = statistics.findings()
 
     assert findings == []
-    assert {each.kind for each in untold} == {FaultKind.MISSING, FaultKind.JITTER}
+    assert {each.kind for each in undetermined} == {FaultKind.MISSING, FaultKind.JITTER}

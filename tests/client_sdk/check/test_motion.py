@@ -1,4 +1,4 @@
-"""Motion beside an odometry or an IMU: delay, scale, mirror and axes, each with its deviation."""
+"""Motion compared with odometry or an IMU: delay, scale, mirror and axes, each with its deviation."""
 
 from __future__ import annotations
 
@@ -116,25 +116,25 @@ def test_a_drive_at_one_speed_without_turns_tells_no_delay() -> None:
 
     noise = rng.standard_normal((len(stamps_s), 6)) * np.repeat((1e-3, 5e-4), 3)
     reference = MotionReference(path=Trajectory(known_s, straight(known_s)))
-    findings, untold = check_motion(
+    findings, undetermined = check_motion(
         CameraMotion(stamps_s=stamps_s, T_world_camera=straight(stamps_s) @ exp_se3(noise)), reference
     )
 
     assert findings == []
-    assert {FaultKind.STAMP_DELAY, FaultKind.MIRRORED} <= {each.kind for each in untold}
+    assert {FaultKind.STAMP_DELAY, FaultKind.MIRRORED} <= {each.kind for each in undetermined}
 
 
 def test_paths_that_have_nothing_in_common_are_not_compared() -> None:
     known_s = np.arange(0.0, 23.0, 0.05)
     other = InertialDrive(MODEL, Motion(), seed=99).T_world_camera(known_s)
 
-    findings, untold = check_motion(
+    findings, undetermined = check_motion(
         CameraMotion(stamps_s=stamps(), T_world_camera=tracked(stamps())),
         MotionReference(path=Trajectory(known_s, other)),
     )
 
     assert findings == []
-    assert untold
+    assert undetermined
 
 
 def test_without_a_reference_it_is_said_what_cannot_be_checked() -> None:
@@ -166,14 +166,14 @@ def test_axes_of_an_imu_that_are_turned_are_found() -> None:
     assert finding.kind is FaultKind.SWAPPED_AXES
 
 
-def test_what_a_pair_cannot_tell_of_its_metres_is_its_baseline() -> None:
+def test_an_undetermined_scale_of_a_pair_is_its_baseline() -> None:
     near, known_s = tracked(stamps()).copy(), np.arange(0.0, 23.0, 0.05)
     path = drive().T_world_camera(known_s).copy()
     near[:, :3, 3] *= 0.02
     path[:, :3, 3] *= 0.02
     motion = CameraMotion(stamps_s=stamps(), T_world_camera=near, scale_source="stereo")
 
-    _, untold = check_motion(motion, MotionReference(path=Trajectory(known_s, path)))
+    _, undetermined = check_motion(motion, MotionReference(path=Trajectory(known_s, path)))
 
-    assert FaultKind.BASELINE in {each.kind for each in untold}
-    assert FaultKind.DEPTH_SCALE not in {each.kind for each in untold}
+    assert FaultKind.BASELINE in {each.kind for each in undetermined}
+    assert FaultKind.DEPTH_SCALE not in {each.kind for each in undetermined}

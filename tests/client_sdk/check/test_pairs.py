@@ -81,7 +81,7 @@ def test_few_keyframes_tell_no_offset_but_leave_metres_in_doubt() -> None:
 
 
 def checked(scale: float, offsets: dict[int, StereoAdjustment]) -> CheckReport:
-    """Return what is said of a stereo drive whose path is too large by *scale* beside its odometry."""
+    """Return what is said of a stereo drive whose path is too large by *scale* compared with its odometry."""
     drive = DriveObserver(MotionReference(path=Trajectory(STAMPS_S, path())))
     image = np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8)
     for stamp_s, pose in zip(STAMPS_S, path(scale), strict=True):
@@ -114,8 +114,8 @@ def test_a_baseline_is_not_told_where_an_offset_could_be_the_cause() -> None:
     report = checked(1.03, {0: adjustment(0.0, 0.25)})
 
     assert kinds(report) == set()
-    untold = next(each for each in report.cannot_tell if each.kind is FaultKind.BASELINE)
-    assert "uncertainty of the calibration" in untold.reason
+    undetermined = next(each for each in report.cannot_tell if each.kind is FaultKind.BASELINE)
+    assert "uncertainty of the calibration" in undetermined.reason
 
 
 def test_a_wrong_lens_leaves_no_word_about_disparities(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,10 +64,10 @@ def test_it_writes_a_table_a_picture_and_the_trajectories(
 ) -> None:
     report = compare(tmp_path, "default", "without-depth", change=black)
 
-    told = capsys.readouterr().out
-    assert "flat at 10 Hz, colour + depth: 10 frames, 0.9 s; ground truth, SE(3) and Sim(3)" in told
-    assert "7 of 10" in told
-    assert "truth interpolated between true poses at most 0.25 s apart" in told
+    reported = capsys.readouterr().out
+    assert "flat at 10 Hz, colour + depth: 10 frames, 0.9 s; ground truth, SE(3) and Sim(3)" in reported
+    assert "7 of 10" in reported
+    assert "truth interpolated between true poses at most 0.25 s apart" in reported
     assert report["max_truth_gap_s"] == 0.25
     assert [row["alignment"] for row in report["rows"]] == ["SE(3)", "Sim(3)"]
     assert {"commit", "cores", "load_average", "load_average_after"} <= report["environment"].keys()
@@ -98,8 +98,8 @@ def test_a_recording_without_truth_is_said_in_one_line(
 ) -> None:
     report = compare(tmp_path, "default", has_truth=False)
 
-    told = capsys.readouterr().out
-    assert "default: the recording has no truth: no ATE, no RPE" in told
-    assert "ATE cm" not in told
+    reported = capsys.readouterr().out
+    assert "default: the recording has no truth: no ATE, no RPE" in reported
+    assert "ATE cm" not in reported
     assert report["rows"][0]["figures"]["posed"] == [10, 10]
     assert (tmp_path / "compare.png").stat().st_size > 0

@@ -51,17 +51,17 @@ def test_right_and_wrong_solutions_of_every_payload_are_recognised(codec_name: s
 
 
 def rows() -> ResultRows:
-    told = ResultRows()
+    reported = ResultRows()
     nan = math.nan
     for row, server, code in (
         ((4, 1, 1.0, 1.01, 1.13, 3500, 1.5, 0.25, 2.0, 3.0), "server-1", "ok"),
         ((4, 2, 1.2, 1.20, 6.20, 3500, nan, nan, nan, nan), "", "expired"),
         ((4, 3, 1.4, 1.40, nan, 0, nan, nan, nan, nan), "", ""),
     ):
-        told.numbers.extend(row)
-        told.servers.append(server)
-        told.codes.append(code)
-    return told
+        reported.numbers.extend(row)
+        reported.servers.append(server)
+        reported.codes.append(code)
+    return reported
 
 
 def result(commands: list[CommandRecord]) -> SwarmResult:
@@ -94,7 +94,7 @@ def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
 )  # fmt: skip
 def test_a_file_that_is_no_scenario_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "made").write_bytes(text.encode("latin-1"))
-    with pytest.raises(UsageError, match=says) as told:
+    with pytest.raises(UsageError, match=says) as reported:
         read_scenario(tmp_path / "made")
-    assert told.value.hint
-    assert "\n" not in told.value.message
+    assert reported.value.hint
+    assert "\n" not in reported.value.message

@@ -1,4 +1,4 @@
-"""Where robots went in a merged map, how far that is from the truth, and what a person is told of it."""
+"""The trajectories of robots in a merged map, their errors against the truth, and the text about them."""
 
 from __future__ import annotations
 

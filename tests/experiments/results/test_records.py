@@ -19,8 +19,8 @@ def test_samples_of_the_monitor_are_read_back_as_they_were_written(tmp_path):
         "something": "new",
     }  # fmt: skip
     silent = {"name": "server-2", "pid": 8, "state": "starting", "cpu_percent": None}
-    told = {"time": ORIGIN_S + 1.5, "healthy_servers": 1, "servers": [full, silent]}
-    readings = [sample_from_document(told, ORIGIN_S), run_sample(time_s=2.0, healthy_servers=0)]
+    reported = {"time": ORIGIN_S + 1.5, "healthy_servers": 1, "servers": [full, silent]}
+    readings = [sample_from_document(reported, ORIGIN_S), run_sample(time_s=2.0, healthy_servers=0)]
 
     with (tmp_path / "samples.csv").open("w", newline="") as file:
         log = SampleLog(file)

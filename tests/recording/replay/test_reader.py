@@ -1,4 +1,4 @@
-"""Recordings are read in order, up to where they are cut off; what is no recording is told in one line."""
+"""Recordings are read in order, up to where they are cut off; a file that is no recording is an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a worker tells of messages that it has read saves the recorder work, and changes nothing recorded."""
+"""The contents of messages that a worker sends along save the recorder work, and change nothing recorded."""
 
 from __future__ import annotations
 
@@ -94,14 +94,14 @@ def recorded(folder: Path, entries: list[PipeEntry], codec: str) -> list[tuple[s
 def test_a_command_that_was_read_and_its_answer_are_recorded_as_if_nothing_had_been_told(
     codec: str, pipe: tuple[int, int], tmp_path: Path
 ):
-    told = handed(pipe, codec, command(codec, stream="pose", keep=True), Ping(sent_s=1.0))
+    reported = handed(pipe, codec, command(codec, stream="pose", keep=True), Ping(sent_s=1.0))
     heads = {DECODED_COMMAND: 9 + len("pose "), ANSWER_WITH_POSE: 8 + 16 * 8}
     plain = [
-        PipeEntry(PAIRS.get(kind, kind), n, at, data[heads.get(kind, 0) :]) for kind, n, at, data in told
+        PipeEntry(PAIRS.get(kind, kind), n, at, data[heads.get(kind, 0) :]) for kind, n, at, data in reported
     ]
 
-    assert [each.kind for each in told] == [1, UP, DOWN, DECODED_COMMAND, ANSWER_WITH_POSE, UP, DOWN]
-    found = recorded(tmp_path / "told", told, codec)
+    assert [each.kind for each in reported] == [1, UP, DOWN, DECODED_COMMAND, ANSWER_WITH_POSE, UP, DOWN]
+    found = recorded(tmp_path / "reported", reported, codec)
     assert len(found) == 7
     assert found == recorded(tmp_path / "plain", plain, codec)
 
@@ -113,9 +113,9 @@ def test_a_command_that_was_read_and_its_answer_are_recorded_as_if_nothing_had_b
 def test_nothing_is_reported_of_a_command_that_was_not_read_as_a_request(
     codec: str, payload: Any, pipe: tuple[int, int]
 ):
-    told = handed(pipe, codec, Command(id=5, service="pnp", payload=payload))
+    reported = handed(pipe, codec, Command(id=5, service="pnp", payload=payload))
 
-    assert [each.kind for each in told[3:]] == [UP, DOWN]
+    assert [each.kind for each in reported[3:]] == [UP, DOWN]
 
 
 @pytest.mark.parametrize("codec", CODECS)

@@ -22,7 +22,7 @@ def stiff(**like: Any) -> Made:
     return Made(turn=0.01, roll=0.01, **like)
 
 
-def untold(made: Made) -> dict[FaultKind, str]:
+def unchecked(made: Made) -> dict[FaultKind, str]:
     judgement = check_calibration(make_store(made))
     assert not judgement.findings
     return {each.kind: each.reason for each in judgement.cannot_tell}
@@ -61,11 +61,11 @@ def untold(made: Made) -> dict[FaultKind, str]:
 def test_the_reason_is_what_the_drive_lacks(
     lacking: Made, kind: FaultKind, reason: str, better: dict[str, Any]
 ) -> None:
-    assert reason in untold(lacking)[kind]
-    assert kind not in untold(replace(lacking, **better))
+    assert reason in unchecked(lacking)[kind]
+    assert kind not in unchecked(replace(lacking, **better))
 
 
-def test_a_drive_that_was_not_tracked_cannot_tell_its_lens_and_says_so() -> None:
+def test_a_drive_that_was_not_tracked_does_not_determine_its_lens() -> None:
     store = make_store(Made(seed=82, has_depth=False))
     assert FOCAL not in {each.kind for each in check_calibration(store).cannot_tell}
     for keyframe in store.keyframes[4:]:
@@ -76,7 +76,7 @@ def test_a_drive_that_was_not_tracked_cannot_tell_its_lens_and_says_so() -> None
     assert "a pose in 4 of 30 views only" in reasons[FOCAL]
 
 
-def test_a_drive_that_cannot_tell_an_offset_of_depths_doubts_its_metres() -> None:
+def test_an_undetermined_offset_of_depths_makes_the_scale_uncertain() -> None:
     flat = Made(seed=83, is_wall=True, turn=0.03, moves_m=(0.6, 0.6, 0.0))
 
     deviations = [check_calibration(make_store(made)).scale_deviation for made in (flat, Made(seed=83))]
