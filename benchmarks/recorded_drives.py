@@ -23,6 +23,7 @@ from rse_pf.geometry import Array
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 
+# Folder of the recording 7-Scenes RedKitchen.
 RED_KITCHEN = "7scenes_redkitchen"
 
 

@@ -37,6 +37,7 @@ __all__ = ["HOSTILE_SIZES", "GuardedBuffer", "depth", "describe", "match", "trac
 
 Anything = npt.NDArray[Any]
 
+# Camera of the inputs; its principal point is near a corner.
 _CAMERA = Camera(fx=300.0, fy=310.0, cx=3.5, cy=4.0, width=640, height=480)
 _HEAD = 8  # number of bytes at the start of an input that choose sizes and kinds; the others are the data
 # Sizes of arrays that no caller may pass to the library, which has to refuse them.

@@ -25,6 +25,7 @@ from rse_pf.http.connections import bounded_protocol
 
 __all__ = ["Request", "compare", "disagreement"]
 
+# Header lines of random requests, well-formed and malformed.
 _LINES = (
     b"Host: x", b"Host: y:80", b"Content-Length: 5", b"Content-Length: 0", b"Transfer-Encoding: chunked",
     b"Transfer-Encoding: identity", b"Connection: close", b"Connection: keep-alive, upgrade",
@@ -32,13 +33,16 @@ _LINES = (
     b"X-Forwarded-For: 10.0.0.1", b"Upload-Offset: 0", b"Upgrade: websocket", b"Accept: */*",
     b"X: \xc3\xa4", b"X:", b" folded", b"\tfolded",
 )  # fmt: skip
+# Bodies of random requests.
 _BODIES = (b"", b"hello", b"5\r\nhello\r\n0\r\n\r\n", b"0\r\n\r\n", b"5;a=b\r\nhello\r\n0\r\nX: y\r\n\r\n")
+# Request lines of random requests.
 _STARTS = (
     b"GET / HTTP/1.1",
     b"PUT /data/v1/objects/ab?x=%20y HTTP/1.1",
     b"POST /a HTTP/1.1",
     b"HEAD /b HTTP/1.0",
 )
+# Bytes that mutations insert.
 _TOKENS = (
     b"\r\n", b"\n", b"\r", b"\0", b"\t", b"\x0b", b"\x0c", b" ", b":", b",", b";", b"0x", b"+", b"-1",
     b"\x7f", b"\x80", b"\xff", b"\xa0", b"chunked", b"Content-Length", b"Transfer-Encoding",

@@ -116,7 +116,9 @@ def _check_keyframe(keyframe: SentKeyframe) -> None:
 
 
 _WORLD, _ = make_world(7, points=1500).walk("robot-1", np.linspace(0.0, 0.05, 2), seed=2)
+# Camera of the rendered keyframe.
 _CAMERA: Camera = _WORLD.keyframes[0].camera
+# Valid features of a rendered keyframe, with which decoded keyframes are matched.
 _KNOWN = make_features(
     _WORLD.keyframes[0].pixels, _WORLD.keyframes[0].points_camera[:, 2], _WORLD.keyframes[0].descriptors
 )

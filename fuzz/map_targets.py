@@ -29,12 +29,16 @@ from tests.kit.synthetic_maps import make_world
 
 __all__ = ["cloud", "graph", "keyframes", "maps", "snapshots"]
 
+# Settings of a server with its default limits.
 _SETTINGS = PlatformSettings()
+# The built-in services.
 _REGISTRY = builtin_services(_SETTINGS)
+# Codecs that encode results and answers.
 _CODECS = tuple(make_codec(name, _SETTINGS.session) for name in ("bin", "json"))
 _MAGIC = b"RSEMAP1\n"  # first bytes of a map
 _LONG_TEXT = 16_384
 """Longest text of a pose graph in bytes, so that many graphs are tried in a second; the rest is ignored."""
+# Camera of the keyframes, px.
 _CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 
@@ -185,6 +189,7 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
 
 
 _WORLD, _ = make_world(7, points=400).walk("robot-1", np.linspace(0.0, 0.1, 3), seed=2)
+# Points on the walls of a room, metres: the valid target cloud.
 _ROOM = np.random.default_rng(1).uniform(0, 4, 3000).reshape(-1, 3)
 _ROOM[np.arange(1000), np.arange(1000) % 3] = 0.0
 _ROOM = _ROOM.ravel().tolist()

@@ -123,12 +123,17 @@ def _text(size: int) -> bytes:
 _COUNT = 24_900  # number of entries of an expensive map
 _ALL = 1_048_000  # size in bytes of an expensive text, below the limit of 1 MiB after inflation
 _VALUES = 29_900  # number of texts in an expensive list
+# Entries of a MessagePack map with different keys.
 _PACKED_KEYS = b"".join(b"\xa5k%04x\1" % k for k in range(14_900))
+# Entries of a JSON object with different keys.
 _KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
+# Entries of a MessagePack map with numbers as keys.
 _NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
 # Ten bits of an empty deflate block: not the last block, fixed codes, and the code that ends the block.
 _EMPTY_BLOCK_BITS = 0b10
+# Four empty deflate blocks, which fill five bytes.
 _EMPTY_BLOCKS = sum(_EMPTY_BLOCK_BITS << 10 * k for k in range(4)).to_bytes(5, "little")
+# Numbers of JSON with many different digits.
 _DIGITS = b"".join(b"0.%016d," % (k * k * 2654435761 % 10**16) for k in range(29_000))
 
 EXPENSIVE: dict[str, tuple[str, bytes]] = {
@@ -285,6 +290,7 @@ def _live_keyframes() -> list[bytes]:
     return [head + data[skipped:] for data in coded for head, skipped in ((b"\x00", 0), (b"\x05", 162))]
 
 
+# Functions that make the initial inputs, by name of the target.
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,

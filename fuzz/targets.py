@@ -58,6 +58,7 @@ _ENCODERS = {
 }
 _SHORT = 8192
 """Longest message, in bytes, whose payload is passed to every service; it bounds the time of an input."""
+# The built-in services.
 _REGISTRY = builtin_services(PLATFORM)
 # Codecs of a server, by name.
 _MADE = {
@@ -65,6 +66,7 @@ _MADE = {
 }
 # Codecs of a robot, by name.
 _OF_ROBOTS = {name: make_codec(name, PLATFORM.session) for name in CODECS}
+# The built-in services, by which payloads are tried.
 _SERVICES: tuple[Service, ...] = tuple(_REGISTRY)
 
 
@@ -263,6 +265,7 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
     return np.resize(found, count).tolist() if len(found) else [0.0] * count
 
 
+# The fuzz targets by name.
 TARGETS: dict[str, Target] = {
     "codec": codec, "frames": frames, "stream": stream, "geometry": geometry, "maps": map_targets.maps,
     "keyframes": map_targets.keyframes, "snapshots": map_targets.snapshots, "graph": map_targets.graph,

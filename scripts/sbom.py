@@ -17,6 +17,7 @@ from rse_pf.extensions.fleet_page.static_files import vendored
 
 __all__ = ["main", "with_vendored"]
 
+# Folder of the third-party files in the fleet page.
 _FOLDER = "rse_pf/extensions/fleet_page/static/vendor"
 
 

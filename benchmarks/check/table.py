@@ -39,6 +39,7 @@ _PARTS = (("7scenes_redkitchen", 0, 125), ("7scenes_redkitchen", 125, 125), ("tu
           ("tum_fr1_rpy_start", 150, 150), ("euroc_mh01_start", 60, 100), ("euroc_mh01_start", 220, 100),
           ("kitti_06_start", 0, 51))  # fmt: skip
 """Checked parts of recordings: name of the recording, first frame, number of frames."""
+# Names of the checked recordings.
 _RECORDINGS = {name for name, _, _ in _PARTS}
 # Largest relative error of the value of a finding that counts as near the planted value.
 _MAX_VALUE_ERROR = 0.2

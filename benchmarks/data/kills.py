@@ -36,6 +36,7 @@ from rse_pf.data_server.server import KeysFile, serve_data
 from rse_pf.storage.object_store import DirectoryStore
 
 ROOT = Path(__file__).resolve().parents[2]
+# Key that signs the tokens of the robot.
 KEY = SigningKey.from_seed(b"k" * 32, "key-1")
 CALLS = (
     "open", "write", "pwrite", "fsync", "replace", "rename", "mkdir", "close", "unlink", "rmdir", "ftruncate",

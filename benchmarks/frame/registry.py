@@ -45,6 +45,7 @@ class Benchmark:
     bars: tuple[Bar, ...]
 
 
+# Registered benchmarks by name; importing the module of a benchmark registers it.
 _REGISTERED: dict[str, Benchmark] = {}
 
 

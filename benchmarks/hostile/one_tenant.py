@@ -80,7 +80,9 @@ _WARM_S = 5.0  # time for which the measured robot runs before the first window
 _REST_S = 1.0  # pause between two windows
 _DEADLINE_S = 5.0  # longest wait for an answer, and for the exit of a neighbour
 _LOWEST_PRIORITY = 19  # nice value of a neighbour's process
+# Intrinsics of the camera in requests, px.
 _CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
+# A pose graph of two poses with one edge, as the payload of a long job.
 _GRAPH = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n" + (
     "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
 )
@@ -332,7 +334,9 @@ async def _jobs(robot: Robot, place: _Place) -> None:
     await asyncio.gather(*(work(lane) for lane in range(8)))
 
 
+# Name of the fair neighbour, which keeps its limits.
 FAIR = "fair"
+# The attacks by name.
 ATTACKS: dict[str, Neighbour] = {
     "leave": _leave, "maps": _maps, "keyframes": _keyframes, "topics": _topics, "objects": _objects,
     "versions": _versions, "jobs": _jobs, "descriptors": _descriptors,

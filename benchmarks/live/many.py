@@ -46,7 +46,9 @@ MAX_CORRECTION_P99_MS = 1000.0  # largest p99 of the delay from a keyframe to th
 MAX_POSES_P99_RATIO = 1.3  # largest ratio of the p99 of poses with a live map to that without one
 _FEATURES = "RSE_PF_BENCHMARK_FEATURES"  # environment variable that names the folder of features to robots
 _ABOUT = "about.json"  # file with the numbers of robots, rooms and frames of the prepared features
+# Options of the trackers; features are rounded as the codec zlib sends them.
 _OPTIONS = FrontEndOptions().sent_with("zlib")
+# Fields of `Features` that are stored.
 _ARRAYS = ("pixels", "descriptors", "points_camera", "orientations", "sizes", "distinctiveness")
 
 

@@ -58,6 +58,7 @@ from tests.kit.generated_drives import (
 # Options with a keyframe every 0.1 m or 6 degrees, as in maps of the red kitchen.
 DENSE = FrontEndOptions(is_spread=False, keyframe_m=0.1, keyframe_deg=6.0)
 LATE_FRAMES = 2  # frames by which a correction reaches its robot after the keyframe that caused it
+# Parts of this benchmark, of which a run measures one.
 PARTS = ("kitchen", "foreign", "wrong", "twins", "replay", "growth")
 # Frames of the red kitchen that each of three robots drives.
 KITCHEN_CUTS = {"a": range(84), "b": range(84, 168), "c": range(168, 250)}

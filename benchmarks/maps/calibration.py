@@ -58,7 +58,8 @@ IMAGES = {
     "kitchen": (RED_KITCHEN, "rgb"), "MH_01": ("euroc_mh01_start", "mav0/cam0/data"),
     "KITTI 06": ("kitti_06_start", "image_0"), "KITTI 00": ("kitti_00_left_start", "image_0"),
 }  # fmt: skip
-"""Folder of each recording, and of its images."""
+"""Folder of each recording, and the folder of its images in it."""
+# Names of all recordings and rendered lenses.
 CASES = (*IMAGES, *LENSES)
 
 

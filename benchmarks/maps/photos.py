@@ -54,7 +54,9 @@ from rse_pf.slam.keyframe import max_features
 RIGHT_M = 0.05  # largest distance of a right pose from the truth, metres
 RIGHT_DEG = 2.0  # largest rotation of a right pose against the truth, degrees
 QUALITY = 85  # JPEG quality of the photos
+# Folder of the stereo recording EuRoC MH_01.
 MH_01 = "euroc_mh01_start"
+# Folder of the recording TUM fr1/rpy.
 FR1_RPY = "tum_fr1_rpy_start"
 TWIN_FRAMES = 90  # frames of the drive through a rendered building, 6.8 cm apart
 TWIN_SHIFT_M = 20.0  # distance of the twin from the building of the photos

@@ -54,6 +54,7 @@ from client_sdk.trajectory import Trajectory
 from client_sdk.trajectory_error import accuracy
 from rse_pf.geometry import inverse, rotation_angle_deg
 
+# Parts of this benchmark, of which --only chooses some.
 PARTS = ("drives", "rest", "rotation", "planes")
 SCENES = (
     "7scenes_redkitchen", "tum_fr1_rpy_start", "euroc_mh01_start", "kitti_06_start", "rendered",
@@ -65,6 +66,7 @@ at rest, and the first three as planes."""
 SWAY_DEG = 1.0  # amplitude of the rotation of a moving camera about each axis
 SWAY_PERIOD_S = 2.0  # period of the rotation about y; the rotations about x and z have longer periods
 PATCH_SHARES = (0.1, 0.15, 0.2, 0.25, 0.3)  # area of the patch over that of the image, for each scene at rest
+# Number of frames of a camera that moves past a plane.
 PLANE_FRAMES = 40
 PLANE_PATH_M = 1.2  # distance that the camera moves past a plane, from the first to the last frame
 WRONG_INTRINSICS = ((0.93, 0.0), (0.95, 0.0), (1.05, 0.0), (1.07, 0.0), (1.0, 0.1), (1.0, 0.2))
@@ -77,6 +79,7 @@ RIGHT_ROTATION_DEG = 5.0  # largest error of the rotation of a right relative po
 
 CORRIDOR_ROOMS = 4  # length of a corridor in rooms of the simulator, 5 m each
 CORRIDOR_WIDTH_M = (1.6, 3.0)  # width of the narrowest and of the widest corridor, metres
+# Number of frames of a drive along a corridor.
 CORRIDOR_FRAMES = 60
 CORRIDOR_SPEED_M_S = (0.5, 1.5)  # speed of the slowest and of the fastest drive along a corridor
 PAPER_TEXEL_M = ROOM_M / 1024  # the texture of a wallpaper has 1024 texels, so that it covers a room once

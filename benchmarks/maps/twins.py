@@ -35,10 +35,12 @@ from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, Camera
 
+# Kinds of drives, of which --only chooses some.
 KINDS = ("rooms", "known", "corridor")
+# Intrinsics of the rendered camera, px.
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 
-ROOMS = 5  # rooms of the building
+ROOMS = 5  # number of rooms of the building
 TWIN = 1  # index of the room that is copied
 COPY = 3  # index of the copy of that room
 STEP_M = 0.12  # distance that a robot moves between two frames: 0.6 m/s

@@ -50,6 +50,7 @@ from rse_pf.geometry import Array, inverse
 
 __all__ = []
 
+# Paragraph of the report on figures that are not comparable.
 _NOT_COMPARABLE = """\
 - Time: neither side ran in real time. The CPU of the peer is that of all its threads (tracking, mapping, loop
   closing); ours is that of the robot, on one thread, and of the server's solver with its codec. Between two
@@ -69,8 +70,11 @@ _NOT_COMPARABLE = """\
 - Only the first part of each recording was played, as JPEG: no figure replaces one of the papers."""
 
 Sensor = Literal["RGBD", "STEREO", "MONOCULAR"]
+# Examples of feature plugins that are compared.
 _EXAMPLES = ("sift:sift", "xfeat:xfeat")
+# Folder of the examples of feature plugins.
 _EXAMPLES_FOLDER = Path(__file__).resolve().parents[2] / "examples" / "features"
+# Program that runs ORB-SLAM3 in the peer's environment.
 _PROCESS = Path(__file__).with_name("orbslam3_process.py")
 _KITCHEN = "7scenes_redkitchen"  # recording with depth
 _TURNING = "tum_fr1_rpy_start"  # recording with depth of a camera that turns quickly
@@ -117,6 +121,7 @@ class Row:
     features: tuple[str, ...] = ()
 
 
+# The compared recordings, rates and sensors.
 ROWS = (
     Row(recording=_TURNING, rates_hz=(30, 15, 10, 5), sensor="RGBD", ours="default", features=_EXAMPLES),
     Row(recording=_KITCHEN, rates_hz=(10, 5), sensor="RGBD", ours="default", features=_EXAMPLES),

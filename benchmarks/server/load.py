@@ -39,8 +39,11 @@ __all__ = [
 
 Mode = Literal["open", "early", "closed"]
 
+# Source of the load generator.
 SOURCE = Path(__file__).with_name("load.c")
+# Options of the C compiler.
 FLAGS = ("-O2", "-std=c11", "-Wall", "-Wextra", "-Werror")
+# Options of the linker.
 LIBRARIES = ("-lz", "-lm")
 SAMPLE = np.dtype(
     [("planned_s", "<f8"), ("latency_s", "<f4"), ("late_s", "<f4"), ("group", "<u4"), ("outcome", "<u4")]
@@ -49,6 +52,7 @@ SAMPLE = np.dtype(
 OUTCOMES = ("ok", "failed", "lost", "unsent")
 """Names of the values of the field *outcome* of `SAMPLE`."""
 
+# Default folder of the compiled generator.
 _BUILD = Path(__file__).resolve().parents[2] / "build" / "benchmarks"
 _COMPILE_S = 60.0  # time limit for compiling the generator
 _MARGIN_S = 20.0  # time beyond the plan in which the generator has to exit

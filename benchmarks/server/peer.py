@@ -47,6 +47,7 @@ from rse_pf.errors import ConfigurationError
 from rse_pf.extensions.experiments.load.scenario import LoadScenario
 from rse_pf.pnp.problems import make_problem
 
+# Number of worker processes of each server.
 WORKERS = 2
 FRAMES_PER_S = 5.0
 """Frames that each of the `MANY` robots sends in a second: the rate of the paper (Sect. 6.2)."""
@@ -55,12 +56,15 @@ OUTLIERS = (0.3, 0.5)  # shares of wrong matches
 PEER = "peer"  # name of the paper's design, which speaks JSON+zlib, in figures
 ZLIB = "zlib"  # name of our server with JSON+zlib in figures
 BINARY = "bin"  # name of our server with the binary codec in figures
+# Names of the compared servers.
 SYSTEMS = (PEER, ZLIB, BINARY)
 PROBLEMS = 64  # number of different problems that the load repeats
 
 # Files that the folder of the paper's design must hold.
 _FILES = ("nginx.conf.tmpl", "pnp.lua", "pnp_so.cpp", "pnpmod.lua", "resty")
+# Lua module of nginx, which the paper's design needs.
 _MODULE = Path("/usr/lib/nginx/modules/ngx_http_lua_module.so")
+# Headers of OpenCV, which the paper's design needs.
 _HEADERS = Path("/usr/include/opencv4")
 _START_S = 10.0  # time limit for the start and for the exit of nginx
 _COMPILE_S = 120.0  # time limit for compiling the paper's design
@@ -238,7 +242,7 @@ def _medians(rounds: list[dict[str, Any]], system: str) -> dict[str, Any]:
     return row | {name: sum(window[name] for window in chosen) for name in ("ok", "failed", "lost", "unsent")}
 
 
-def figures_with_bars(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+def compared_figures(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Return those figures of our server that have bars, by codec, share of wrong matches and robots."""
     return {
         f"{row['system']} {round(100 * row['outliers'])} % {row['robots']}": {
@@ -277,13 +281,13 @@ def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
         windows = play(servers, rounds, seconds)
     rows = summarize(windows)
     return {
-        "settings": UNLIMITED, "rows": rows, "figures_with_bars": figures_with_bars(rows), "rounds": windows,
+        "settings": UNLIMITED, "rows": rows, "compared": compared_figures(rows), "rounds": windows,
     }  # fmt: skip
 
 
 @benchmark(
     *(
-        Bar(f"figures_with_bars.{codec} {percent} % {robots}.cpu_ratio", at_least=bar)
+        Bar(f"compared.{codec} {percent} % {robots}.cpu_ratio", at_least=bar)
         for codec, percent, bar in (
             ("zlib", 30, 10.0),
             ("bin", 30, 14.0),
@@ -292,11 +296,11 @@ def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
         )
         for robots in (1, MANY)
     ),
-    Bar("figures_with_bars.zlib 30 % 100.p99_ratio", at_least=8.0),
-    Bar("figures_with_bars.bin 30 % 100.p99_ratio", at_least=12.0),
-    Bar("figures_with_bars.zlib 30 % 100.p99_over_p50", at_most=4.0),
-    Bar("figures_with_bars.bin 30 % 100.p99_over_p50", at_most=4.0),
-    Bar("figures_with_bars.*.without_pose", at_most=0),
+    Bar("compared.zlib 30 % 100.p99_ratio", at_least=8.0),
+    Bar("compared.bin 30 % 100.p99_ratio", at_least=12.0),
+    Bar("compared.zlib 30 % 100.p99_over_p50", at_most=4.0),
+    Bar("compared.bin 30 % 100.p99_over_p50", at_most=4.0),
+    Bar("compared.*.without_pose", at_most=0),
 )
 def run_benchmark(
     *, peer: Annotated[Path, "sources of the paper's design"], rounds: int = 7,

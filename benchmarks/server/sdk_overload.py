@@ -85,8 +85,10 @@ DEADLINE_S = 0.25  # deadline of a command
 TIMES_THE_MOST = 2  # robots of the load generator as a multiple of the most that a real server carries
 LONGEST_S = 120.0  # time limit for the robots of the load generator, and for those of a client
 STEP_S = 5.0  # duration of a step of the search of the most robots
+# Folder of this file, with the programs of the clients.
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+# Names of the measured clients.
 SDKS = ("python", "js", "cpp")
 COMPILE_S = 300.0  # time limit for compiling the C++ client
 

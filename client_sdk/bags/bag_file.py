@@ -26,7 +26,7 @@ _FAULTS = (
 )  # fmt: skip
 """Exceptions that the readers raise for malformed bags, in addition to their own ones."""
 # Action for a bag that cannot be read.
-_REPAIR = "repair it: rosbag reindex (ROS 1), ros2 bag reindex, or mcap recover; or copy it again"
+_REPAIR_HINT = "repair it: rosbag reindex (ROS 1), ros2 bag reindex, or mcap recover; or copy it again"
 
 
 class BrokenMessage(ValueError):
@@ -194,4 +194,4 @@ def _said(error: BaseException) -> str:
 def _hint(path: Path, error: BaseException) -> str:
     if path.suffix == ".mcap" and "rofile" in str(error):
         return "a recording of this platform is read by rse-pf replay; ROS 1 in MCAP: convert it to .bag"
-    return _REPAIR
+    return _REPAIR_HINT

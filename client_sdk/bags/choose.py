@@ -30,7 +30,7 @@ _IMAGES = {IMAGE, COMPRESSED_IMAGE}  # message types of images
 _POSES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)  # message types of poses
 _TF = {TF, TF_OF_ROS1}  # message types of transforms
 _MAX_LISTED = 12  # largest number of topics that an error message lists
-_SIDES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("image_0", "image_1"))
+_LEFT_RIGHT_NAMES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("image_0", "image_1"))
 """Parts of topic names with which drivers and data sets distinguish the left and the right camera."""
 
 
@@ -240,7 +240,7 @@ def _choose_pair(
 
 
 def _side_pairs(images: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> list[tuple[Topic, Topic]]:
-    """Return all pairs of a left and a right topic of one type whose names differ only in one of `_SIDES`."""
+    """Return all pairs of topics of one type whose names differ only in one of `_LEFT_RIGHT_NAMES`."""
     good = {
         (each.name, each.kind): each
         for each in images
@@ -248,7 +248,7 @@ def _side_pairs(images: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> 
     }
     pairs = []
     for (name, kind), left in good.items():
-        for one, other in _SIDES:
+        for one, other in _LEFT_RIGHT_NAMES:
             head, found, tail = name.rpartition(one)
             names = (name.replace(one, other), f"{head}{other}{tail}") if found else ()
             partner = next((good[each, kind] for each in names if (each, kind) in good), None)

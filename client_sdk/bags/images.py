@@ -20,7 +20,7 @@ from rse_pf.images import load_opencv, photo_size
 
 __all__ = ["ImageFormat", "check_image", "decode_colour", "decode_depth", "format_of"]
 
-_COLOUR = {
+_COLOUR_ENCODINGS = {
     "rgb8": (3, None), "bgr8": (3, "BGR2RGB"), "rgba8": (4, "RGBA2RGB"), "bgra8": (4, "BGRA2RGB"),
     "8UC3": (3, "BGR2RGB"), "8UC4": (4, "BGRA2RGB"),
     "mono8": (1, "GRAY2RGB"), "8UC1": (1, "GRAY2RGB"),
@@ -31,7 +31,8 @@ _COLOUR = {
 }  # fmt: skip
 """Encodings of colour images, each with the bytes of a pixel and OpenCV's conversion to RGB (None for
 RGB)."""
-_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}  # encodings of depth images, and their numpy types
+# Encodings of depth images, and the numpy types of their pixels.
+_DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 _JPEG = b"\xff\xd8"  # first bytes of a JPEG image
 _PNG = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG image
@@ -64,9 +65,9 @@ def format_of(message: Any, kind: str) -> ImageFormat:
     holds: Literal["colour", "depth", ""] = ""
     if kind != COMPRESSED_IMAGE:
         encoding = str(message.encoding)
-        if encoding in _COLOUR:
+        if encoding in _COLOUR_ENCODINGS:
             holds = "colour"
-        elif encoding in _DEPTH:
+        elif encoding in _DEPTH_ENCODINGS:
             holds = "depth"
         size = (int(message.width), int(message.height))
         return ImageFormat(holds=holds, encoding=encoding, frame=message.header.frame_id, size=size)
@@ -126,7 +127,7 @@ def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
         image = _decode(cv2, np.asarray(message.data), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         rgb: npt.NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb
-    bytes_per_px, conversion = _COLOUR[message.encoding]
+    bytes_per_px, conversion = _COLOUR_ENCODINGS[message.encoding]
     rows = _rows(message)
     pixels = rows.reshape(message.height, message.width, bytes_per_px)
     if conversion is None:
@@ -148,7 +149,7 @@ def decode_depth(message: Any, depth_scale: float) -> npt.NDArray[np.float32]:
         MissingExtra: OpenCV is not installed.
     """
     if hasattr(message, "encoding"):
-        kind = np.dtype(_DEPTH[message.encoding]).newbyteorder(">" if message.is_bigendian else "<")
+        kind = np.dtype(_DEPTH_ENCODINGS[message.encoding]).newbyteorder(">" if message.is_bigendian else "<")
         values = _rows(message).view(kind)
         return _metres_of_floats(values) if kind.kind == "f" else _metres_of_units(values, depth_scale)
     cv2 = load_opencv()
@@ -184,7 +185,11 @@ def _decode(cv2: Any, data: npt.NDArray[np.uint8], flags: int) -> npt.NDArray[An
 def _rows(message: Any) -> npt.NDArray[np.uint8]:
     """Return the rows ``(h, bytes)`` of a raw image without padding; raises BrokenMessage if too short."""
     encoding = message.encoding
-    bytes_per_px = _COLOUR[encoding][0] if encoding in _COLOUR else np.dtype(_DEPTH[encoding]).itemsize
+    bytes_per_px = (
+        _COLOUR_ENCODINGS[encoding][0]
+        if encoding in _COLOUR_ENCODINGS
+        else np.dtype(_DEPTH_ENCODINGS[encoding]).itemsize
+    )
     used, height, step = message.width * bytes_per_px, message.height, message.step
     if not used or not height or step < used or len(message.data) < step * height:
         raise BrokenMessage(

@@ -11,9 +11,9 @@ from rse_pf.geometry import Array, Lens
 
 __all__ = ["mismatch_px"]
 
-_FEATURES = 600  # number of features that are extracted from each image
+_EXTRACTED_FEATURES = 600  # number of features that are extracted from each image
 _MIN_MATCHES = 30  # fewest matches of two images from which a change of the lens is checked
-_ITERATIONS = 10  # iterations of the rotation fit, which is reweighted by a Cauchy loss
+_ROTATION_FIT_ITERATIONS = 10  # iterations of the rotation fit, which is reweighted by a Cauchy loss
 
 _Image = npt.NDArray[np.uint8]
 
@@ -29,7 +29,7 @@ def mismatch_px(before: _Image, after: _Image, lens: Lens, other: Lens) -> tuple
     Returns:
         None if the images have fewer than 30 matches.
     """
-    first, second = describe(before, _FEATURES), describe(after, _FEATURES)
+    first, second = describe(before, _EXTRACTED_FEATURES), describe(after, _EXTRACTED_FEATURES)
     rows, others = match_features(first, second)
     if len(rows) < _MIN_MATCHES:
         return None
@@ -45,7 +45,7 @@ def _residual(rays: Array, others: Array) -> float:
     """Return the median angle, rad, between *rays* and *others* ``(n, 3)`` after the best rotation."""
     weights = np.ones(len(rays))
     angles = weights
-    for _ in range(_ITERATIONS):
+    for _ in range(_ROTATION_FIT_ITERATIONS):
         u, _, vt = np.linalg.svd((others * weights[:, None]).T @ rays)
         rotation = u @ np.diag((1.0, 1.0, np.linalg.det(u @ vt))) @ vt
         angles = np.linalg.norm(rays @ rotation.T - others, axis=1)

@@ -33,8 +33,8 @@ _FAULTS = (
     struct.error,
 )  # fmt: skip
 """Exceptions that `rosbags` raises for malformed messages, in addition to its own ones."""
-_FLOAT32 = 7  # value of FLOAT32 in ``sensor_msgs/PointField``
-_UINT32 = 6  # value of UINT32 in ``sensor_msgs/PointField``
+_FLOAT32 = 7  # number of the type FLOAT32 in ``sensor_msgs/PointField``
+_UINT32 = 6  # number of the type UINT32 in ``sensor_msgs/PointField``
 
 
 class MessageMaker:

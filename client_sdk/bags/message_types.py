@@ -32,6 +32,7 @@ __all__ = [
     "load_types",
 ]
 
+# Names of ROS message types, as ROS 2 spells them.
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -49,7 +50,9 @@ FLOAT = "std_msgs/msg/Float32"
 STRING = "std_msgs/msg/String"
 TRANSFORM = "geometry_msgs/msg/Transform"
 
+# Definition of ``std_msgs/Header`` in ROS 2.
 _HEADER = "time stamp\nstring frame_id"
+# Definitions that ROS 1 and ROS 2 share, by name of the type.
 _COMMON = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
     "geometry_msgs/msg/Vector3": "float64 x\nfloat64 y\nfloat64 z",
@@ -107,6 +110,7 @@ _COMMON = {
     ),
     DIAGNOSTICS: "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
 }
+# Definition of ``sensor_msgs/CameraInfo``; ROS 1 and ROS 2 differ in the names of its matrices.
 _CAMERA = (
     "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] {d}\n"
     "float64[9] {k}\nfloat64[9] {r}\nfloat64[12] {p}\nuint32 binning_x\nuint32 binning_y\n"

@@ -17,7 +17,8 @@ __all__ = ["PoseTopic", "TransformTree"]
 
 _MAX_GAP_NS = 200_000_000
 """Longest time, nanoseconds, between two transforms between which a pose is interpolated."""
-_MAX_DEPTH = 64  # largest number of transforms from a frame to its root; ends the search in a cycle
+# Largest number of transforms from a frame to its root; ends the search in a cycle.
+_MAX_TRANSFORMS_TO_ROOT = 64
 
 
 @dataclass(slots=True)
@@ -91,7 +92,7 @@ class TransformTree:
     def root_of(self, frame: str) -> tuple[str, bool]:
         """Return the root of the tree that contains *frame*, and whether *frame* can move relative to it."""
         frame, moves = frame.strip("/"), False
-        for _ in range(_MAX_DEPTH):
+        for _ in range(_MAX_TRANSFORMS_TO_ROOT):
             edge = self._edges.get(frame)
             if edge is None:
                 break
@@ -103,7 +104,7 @@ class TransformTree:
         """Return ``T_root_frame`` at a time; None if a transform is missing then."""
         T = np.eye(4)
         frame = frame.strip("/")
-        for _ in range(_MAX_DEPTH):
+        for _ in range(_MAX_TRANSFORMS_TO_ROOT):
             edge = self._edges.get(frame)
             if edge is None:
                 return T
@@ -135,7 +136,7 @@ class TransformTree:
         frame = frame.strip("/")
         way = {frame: np.eye(4)}
         T = np.eye(4)
-        for _ in range(_MAX_DEPTH):
+        for _ in range(_MAX_TRANSFORMS_TO_ROOT):
             edge = self._edges.get(frame)
             T_parent_child = edge.at(0) if edge is not None and edge.is_static else None
             if edge is None or T_parent_child is None:

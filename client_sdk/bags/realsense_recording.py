@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, from_quaternion, inverse
 
 __all__ = ["stated_T_colour_depth", "stated_depth_unit_m"]
 
-_IMAGES = "/image/data"  # ending of the names of image topics
+_IMAGE_TOPIC_ENDING = "/image/data"  # ending of the names of image topics
 
 
 def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:
@@ -47,7 +47,7 @@ def stated_T_colour_depth(file: BagFile, colour: str, depth: str) -> Array | Non
 
 
 def _stream_of(topic: str) -> str:
-    return topic.removesuffix(_IMAGES) if topic.endswith(_IMAGES) else ""
+    return topic.removesuffix(_IMAGE_TOPIC_ENDING) if topic.endswith(_IMAGE_TOPIC_ENDING) else ""
 
 
 def _first(file: BagFile, start: str, kind: str) -> Any | None:

@@ -11,8 +11,9 @@ from rse_pf.geometry import Camera
 
 __all__ = ["corrected"]
 
-_CAMERA = ("fx", "fy", "cx", "cy")  # intrinsics of the pinhole camera, px, that a correction may replace
-_MODEL = "radial-tangential"  # the lens model whose coefficient ``k1`` a correction of the distortion gives
+_INTRINSICS = ("fx", "fy", "cx", "cy")  # intrinsics of the pinhole camera, px, that a correction may replace
+# The lens model whose coefficient ``k1`` a correction of the distortion gives.
+_CORRECTED_MODEL = "radial-tangential"
 
 
 def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intrinsics, tuple[str, ...]]:
@@ -23,16 +24,16 @@ def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intr
     """
     changed: list[str] = []
     camera, lens = intrinsics.camera, intrinsics.distortion
-    values = {name: getattr(camera, name) for name in _CAMERA}
+    values = {name: getattr(camera, name) for name in _INTRINSICS}
     scale = intrinsics.depth_scale
     for finding in findings:
         if not finding.is_certain:
             continue
-        for name in _CAMERA:
+        for name in _INTRINSICS:
             if name in finding.correction:
                 changed.append(f"{name} {values[name]:.2f} to {finding.correction[name]:.2f}")
                 values[name] = finding.correction[name]
-        if "k1" in finding.correction and intrinsics.model == _MODEL and not any(lens):
+        if "k1" in finding.correction and intrinsics.model == _CORRECTED_MODEL and not any(lens):
             lens = (finding.correction["k1"], 0.0, 0.0, 0.0)
             changed.append(f"k1 0 to {lens[0]:.4f}")
         if finding.kind is FaultKind.DEPTH_SCALE:

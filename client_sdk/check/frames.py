@@ -20,11 +20,11 @@ __all__ = ["FrameStatistics", "sharpness"]
 
 _Image = npt.NDArray[np.uint8]
 # Action of findings on blurred images.
-_SHARPEN = "drive more slowly, shorten the exposure or add light, and focus the lens"
+_SHARPEN_HINT = "drive more slowly, shorten the exposure or add light, and focus the lens"
 # Action of findings on dark images.
-_LIGHTEN = "add light, lengthen the exposure, or uncover the lens"
+_LIGHTEN_HINT = "add light, lengthen the exposure, or uncover the lens"
 # Action for images with too few edges.
-_SHOW_TEXTURE = "point the camera at things with texture, not at a bare wall or the sky alone"
+_SHOW_TEXTURE_HINT = "point the camera at things with texture, not at a bare wall or the sky alone"
 
 # Approximate number of rows, and of columns, that are searched for edges: bounds the time.
 _SAMPLED_LINES = 60
@@ -104,11 +104,11 @@ class FrameStatistics:
         found = [
             self._share_finding(
                 FaultKind.BLUR, self.blurred(), "blurred: their edges are wider than 7 px",
-                _SHARPEN,
+                _SHARPEN_HINT,
             ),
             self._share_finding(
                 FaultKind.DARK, self.dark(), "dark: they show nothing",
-                _LIGHTEN,
+                _LIGHTEN_HINT,
             ),
             self._share_finding(
                 FaultKind.REPEATED, self.repeated(), "the image before once more, with a new time stamp",
@@ -158,8 +158,8 @@ class FrameStatistics:
         is_dark = self.dark()
         is_plain = self.empty() & ~is_dark
         causes = (
-            (is_dark, "are dark", _LIGHTEN), (is_plain, "show no texture", _SHOW_TEXTURE),
-            (self.blurred() & ~is_dark & ~is_plain, "are blurred", _SHARPEN),
+            (is_dark, "are dark", _LIGHTEN_HINT), (is_plain, "show no texture", _SHOW_TEXTURE_HINT),
+            (self.blurred() & ~is_dark & ~is_plain, "are blurred", _SHARPEN_HINT),
         )  # fmt: skip
         counts = [int(np.count_nonzero(rows & is_lost)) for rows, *_ in causes]
         total = int(np.count_nonzero(is_lost))

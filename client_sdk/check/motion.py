@@ -39,7 +39,7 @@ _MAX_STEP_S = 1.0  # longest time, seconds, over which a motion is compared
 _MAX_PAIRS = 600  # approximate largest number of motions that are compared: bounds the time
 _MIN_PAIRS = 20  # fewest motions during which both camera and reference have poses
 # Number of consecutive parts of a drive from whose differences standard deviations are computed (jackknife).
-_BLOCKS = 10
+_JACKKNIFE_BLOCKS = 10
 _MAX_DELAY_S = 0.5  # largest delay of the stamps, in seconds, that is tried in both directions
 _DELAY_STEP_S = 0.02  # difference, in seconds, of successive delays that are tried
 _DELAY_MODEL_ERROR_S = 0.003  # standard deviation of the stamps' delay that remains in every drive, seconds
@@ -64,12 +64,14 @@ motions' sum of squares."""
 _MIN_AXES_ANGLE_DEG = 20.0  # smallest rotation between the axes of reference and camera that is a fault
 # Largest rotation, degrees, between the estimated axes and an exact exchange of axes that a message names.
 _MAX_NAMED_AXES_ERROR_DEG = 15.0
-_SEGMENT_M = 0.25  # distance, metres, that the reference moves in each part of a path whose scale is compared
-_SEGMENT_S = 6.0  # longest duration, seconds, of a part of a path whose scale is compared: drift bounds it
-_MIN_SEGMENTS = 12  # fewest parts of a path from whose lengths the scale is computed
+# Distance, metres, that the reference moves in each part of a path whose scale is compared.
+_SCALE_PART_M = 0.25
+# Longest duration, seconds, of a part of a path whose scale is compared: drift bounds it.
+_MAX_SCALE_PART_S = 6.0
+_MIN_SCALE_PARTS = 12  # fewest parts of a path from whose lengths the scale is computed
 MIN_ADJUSTED_KEYFRAMES = 16
 """Fewest adjusted keyframes from which the scale is computed; with fewer ones the tracked poses are used."""
-_ARM_M = 0.5  # typical distance, metres, of a camera from the frame of an odometry: a prior
+_ODOMETRY_ARM_M = 0.5  # typical distance, metres, of a camera from the frame of an odometry: a prior
 # Typical distance, metres, between the camera and a reference that has the poses of the camera itself: a
 # prior.
 _CAMERA_ARM_M = 0.02
@@ -401,9 +403,9 @@ def _delay(
     *interval_s* is the interval between frames; no result if the delay is too small to matter.
     """
     squares = np.array([fit.best for fit in fits])
-    blocks = np.arange(squares.shape[1]) * _BLOCKS // squares.shape[1]
+    blocks = np.arange(squares.shape[1]) * _JACKKNIFE_BLOCKS // squares.shape[1]
     total = squares.sum(axis=1)
-    without = [total - squares[:, blocks == block].sum(axis=1) for block in range(_BLOCKS)]
+    without = [total - squares[:, blocks == block].sum(axis=1) for block in range(_JACKKNIFE_BLOCKS)]
     delay_s, deviation_s = _jackknife(_lowest(total), np.array([_lowest(each) for each in without]))
     deviation_s = math.hypot(deviation_s, _DELAY_MODEL_ERROR_S, _DELAY_ERROR_SHARE * interval_s)
     is_large = abs(delay_s) >= max(_MIN_DELAY_S, _CERTAIN_SIGMAS * deviation_s)
@@ -465,9 +467,9 @@ def _is_certain(one: Array, other: Array) -> bool:
 
     The deviation is computed from the differences in ten consecutive blocks of the drive.
     """
-    blocks = np.arange(len(one)) * _BLOCKS // len(one)
-    gains = np.array([(other - one)[blocks == block].sum() for block in range(_BLOCKS)])
-    return bool(gains.sum() > _CERTAIN_SIGMAS * float(gains.std(ddof=1)) * math.sqrt(_BLOCKS))
+    blocks = np.arange(len(one)) * _JACKKNIFE_BLOCKS // len(one)
+    gains = np.array([(other - one)[blocks == block].sum() for block in range(_JACKKNIFE_BLOCKS)])
+    return bool(gains.sum() > _CERTAIN_SIGMAS * float(gains.std(ddof=1)) * math.sqrt(_JACKKNIFE_BLOCKS))
 
 
 def _axes(fit: _Fit, reference: MotionReference) -> tuple[list[Finding], list[CannotTell]]:
@@ -529,19 +531,19 @@ def _scale(
     kind = FaultKind.BASELINE if motion.scale_source == "stereo" else FaultKind.DEPTH_SCALE
     inside = (stamps_s >= path.timestamps_s.min()) & (stamps_s <= path.timestamps_s.max())
     rows = _segments(stamps_s, path.at(stamps_s)[:, :3, 3], segments, inside)
-    if len(rows) < _MIN_SEGMENTS:
-        reason = f"{len(rows)} parts of the path of {reference.name} are {_SEGMENT_M:g} m long"
+    if len(rows) < _MIN_SCALE_PARTS:
+        reason = f"{len(rows)} parts of the path of {reference.name} are {_SCALE_PART_M:g} m long"
         return [], [CannotTell(kind, reason)]
     A = inverse(path.at(stamps_s[rows[:, 0]])) @ path.at(stamps_s[rows[:, 1]])
     B = inverse(T_world_camera[rows[:, 0]]) @ T_world_camera[rows[:, 1]]
-    arm_m = _CAMERA_ARM_M if reference.is_camera else _ARM_M
+    arm_m = _CAMERA_ARM_M if reference.is_camera else _ODOMETRY_ARM_M
     kept = np.ones(len(rows), dtype=bool)
     for _ in range(4):
         scale, left = _solve_scale(A, B, rotation, arm_m, kept)
         kept = left <= _MAX_RESIDUAL_RATIO * max(float(np.median(left[kept])), 1e-6)
-    blocks = np.arange(len(rows)) * _BLOCKS // len(rows)
+    blocks = np.arange(len(rows)) * _JACKKNIFE_BLOCKS // len(rows)
     without = np.array(
-        [_solve_scale(A, B, rotation, arm_m, kept & (blocks != each))[0] for each in range(_BLOCKS)]
+        [_solve_scale(A, B, rotation, arm_m, kept & (blocks != each))[0] for each in range(_JACKKNIFE_BLOCKS)]
     )
     scale, deviation = _jackknife(_solve_scale(A, B, rotation, arm_m, kept)[0], without)
     if not 1e-3 < scale < 1e3:
@@ -601,11 +603,11 @@ def _segments(
     every = max(1, len(stamps_s) // _MAX_PAIRS)
     for begin in range(0, len(stamps_s), every):
         for end in itertools.count(begin + 1):
-            if end >= len(stamps_s) or stamps_s[end] - stamps_s[begin] > _SEGMENT_S:
+            if end >= len(stamps_s) or stamps_s[end] - stamps_s[begin] > _MAX_SCALE_PART_S:
                 break
             if segments is not None and segments[end] != segments[begin]:
                 break
-            if np.linalg.norm(positions[end] - positions[begin]) >= _SEGMENT_M:
+            if np.linalg.norm(positions[end] - positions[begin]) >= _SCALE_PART_M:
                 if inside[begin] and inside[end]:
                     pairs.append((begin, end))
                 break

@@ -34,7 +34,7 @@ from rse_pf.geometry import Array
 
 __all__ = ["DriveObserver"]
 
-_HIDING = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS, FaultKind.REPEATED}
+_MOTION_FALSIFYING_FAULTS = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS, FaultKind.REPEATED}
 """Faults that falsify the tracked motion, which is then not compared with a reference or an IMU."""
 
 
@@ -135,12 +135,13 @@ class DriveObserver:
     ) -> tuple[list[Finding], list[CannotTell], list[str]]:
         """Compare the motion with odometry, ground truth and IMU: findings, undetermined faults, and notes.
 
-        *known* are the findings so far; one of `_HIDING` among them prevents the comparison.
+        *known* are the findings so far; one of `_MOTION_FALSIFYING_FAULTS` among them prevents the
+        comparison.
         """
         by_depth = self._has_depth or self._has_stereo
         if self.reference is None and self._history is None:
             return [], nothing_to_compare(has_depth=by_depth), []
-        hidden = _HIDING & {each.kind for each in order(known)}
+        hidden = _MOTION_FALSIFYING_FAULTS & {each.kind for each in order(known)}
         if hidden:
             reason = f"{min(each.value for each in hidden)} falsifies the motion that would be compared"
             return (

@@ -20,6 +20,7 @@ from rse_pf.geometry import Array
 
 __all__ = ["PairsCheck", "check_pairs"]
 
+# Kind of the fault that this module finds.
 _KIND = FaultKind.DISPARITY_OFFSET
 _MIN_KEYFRAMES = 12
 """Fewest adjusted keyframes with which a disparity offset is reported.  With 5 to 11 keyframes of EuRoC MH_01

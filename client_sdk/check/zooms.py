@@ -29,11 +29,11 @@ _MAX_JUMP_DIFFERENCE = 0.2
 _MODEL_DEVIATION = 0.005  # standard deviation of a zoom that remains in every drive, whatever its length
 _DEVIATION_INFLATION = 1.5  # factor on the standard deviations of the adjustment, which are too small
 # Number of parts of a drive whose rates of change of the zoom are compared, and fewest keyframes for this.
-_PARTS = 5
+_DRIVE_PARTS = 5
 # The parts of a drive disagree if the standard deviation between them exceeds this many times the standard
 # deviation of the adjustment.
 _DISAGREEMENT_RATIO = 2.0
-_QUANTILE = 0.3
+_NOISE_QUANTILE = 0.3
 """Quantile of the absolute steps between successive zooms from which their noise is computed.  It is below
 the median, so that up to half of the steps may be jumps."""
 _NORMAL_QUANTILE = 0.385  # 0.3 quantile of the absolute values of a normal distribution with deviation 1
@@ -67,7 +67,7 @@ def check_zooms(zoomed: Calibrated, times_s: Array, common: Calibrated) -> ZoomC
         common: The drive, adjusted with one focal length for all keyframes.
     """
     zooms = zoomed.zooms
-    if len(zooms) < _PARTS:
+    if len(zooms) < _DRIVE_PARTS:
         return ZoomCheck()
     steps = np.diff(zooms)
     noise = _noise(zoomed)
@@ -85,7 +85,7 @@ def _noise(zoomed: Calibrated) -> Array:
     own = np.diag(zoomed.zooms_covariance)
     together = np.diag(zoomed.zooms_covariance, 1)
     variances = np.maximum(own[1:] + own[:-1] - 2.0 * together, 0.0)
-    usual = float(np.quantile(np.abs(np.diff(zoomed.zooms)), _QUANTILE)) / _NORMAL_QUANTILE
+    usual = float(np.quantile(np.abs(np.diff(zoomed.zooms)), _NOISE_QUANTILE)) / _NORMAL_QUANTILE
     noise: Array = np.sqrt(_DEVIATION_INFLATION**2 * variances + usual**2)
     return noise
 
@@ -174,7 +174,7 @@ def _check_steady_change(zooms: Array, times_s: Array, common: Calibrated, zoome
 
 def _rates(zooms: Array, times_s: Array) -> Array:
     """Return the rate of change of the zoom, 1/s, in each of 5 consecutive parts of the drive."""
-    ends = np.rint(np.linspace(0, len(zooms) - 1, _PARTS + 1)).astype(np.int64)
+    ends = np.rint(np.linspace(0, len(zooms) - 1, _DRIVE_PARTS + 1)).astype(np.int64)
     rates: Array = np.diff(zooms[ends]) / np.maximum(np.diff(times_s[ends]), 1e-6)
     return rates
 

@@ -156,6 +156,7 @@ def delete_parts(request: CleanRequest, settings: PlatformSettings) -> None:
     show(f"{counted(len(names), 'object')} deleted")
 
 
+# Example in the help and in errors.
 _EXAMPLE = "rse-pf batch run merge robot-1 robot-2 --out kitchen"
 ACTION = Action(
     actions={

@@ -54,11 +54,12 @@ _SCHEDULER_RESTARTS = 3
 _START_TIMEOUT_S = 60.0
 # Time limit for a running scheduler to answer, and then to have a worker, in seconds.
 _REMOTE_TIMEOUT_S = 10.0
+# Pattern of the address of a Dask scheduler.
 _ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?[^\s:/]+(?::[^\s:/]+)*:\d{1,5}")
 # Time between two checks of scheduler and workers while parts are computed, in seconds.
-_POLL_S = 0.2
+_CHECK_INTERVAL_S = 0.2
 # Dask's settings in the environment of scheduler and workers.
-_DASK = {
+_DASK_ENVIRONMENT = {
     "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "10s",
     "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "100",
     "DASK_LOGGING__DISTRIBUTED": "critical",
@@ -185,7 +186,7 @@ class LocalCluster:
         self._key = new_cluster_key()
         self._count = workers
         self._environment = {
-            **_DASK, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
+            **_DASK_ENVIRONMENT, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
         }  # fmt: skip
         self._scheduler: Child | None = None
         self._workers: list[Child] = []
@@ -351,7 +352,7 @@ class DaskEngine:
             while futures:
                 self._check_cluster()
                 try:
-                    future = ended.get(timeout=_POLL_S)
+                    future = ended.get(timeout=_CHECK_INTERVAL_S)
                 except queue.Empty:
                     continue
                 failure = self._answer_of(future)

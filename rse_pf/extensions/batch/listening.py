@@ -15,10 +15,10 @@ __all__ = ["bound_handshakes", "without_pages"]
 
 # Largest number of connections of a listener with unfinished handshakes; above it, the oldest of these
 # connections is closed.
-_MAX_SILENT = 128
+_MAX_UNFINISHED = 128
 # Largest number of connections with unfinished handshakes from one address; above it, the oldest one is
 # closed.
-_MAX_PER_SOURCE = 64
+_MAX_UNFINISHED_OF_ADDRESS = 64
 
 
 def without_pages(kind: Any) -> Any:
@@ -43,7 +43,7 @@ def bound_handshakes() -> None:
         async def start(self) -> None:
             later = asyncio.get_running_loop().call_later
             self.silent: SilentConnections[Any] = SilentConnections(
-                call_later=later, most=_MAX_SILENT, most_per_source=_MAX_PER_SOURCE
+                call_later=later, most=_MAX_UNFINISHED, most_per_source=_MAX_UNFINISHED_OF_ADDRESS
             )
             await super().start()
 

@@ -36,12 +36,12 @@ from rse_pf.storage.object_store import ObjectStore
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 
 # Progress, as a fraction of the whole merge, at which each kind of part begins.
-_SHARES = {
+_PROGRESS_AT_BEGIN = {
     "vectors": 0.0, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
     "cloud": 0.95,
 }  # fmt: skip
 # Name of each kind of part in the text of the progress.
-_DOING = {
+_PROGRESS_TEXTS = {
     "vectors": "views of maps", "pairs": "proposals", "links": "parts of links",
     "agree": "pairs of maps", "tiles": "pairs of clouds", "cloud": "clouds",
 }  # fmt: skip
@@ -174,14 +174,16 @@ class BatchMerge:
         if not parts:
             return []
         kind = parts[0].kind
-        begin = _SHARES[kind]
-        end = min((share for share in _SHARES.values() if share > begin), default=1.0)
+        begin = _PROGRESS_AT_BEGIN[kind]
+        end = min((share for share in _PROGRESS_AT_BEGIN.values() if share > begin), default=1.0)
         missing = list({part.name: part for part in parts if not is_done(self._store, part)}.values())
         known = len(parts) - len(missing)
 
         def on_done(count: int) -> None:
             share = (known + count) / len(parts)
-            self._report(begin + share * (end - begin), f"{known + count} of {len(parts)} {_DOING[kind]}")
+            self._report(
+                begin + share * (end - begin), f"{known + count} of {len(parts)} {_PROGRESS_TEXTS[kind]}"
+            )
 
         on_done(0)
         self._own += [part.name for part in parts]

@@ -38,9 +38,9 @@ PREFIX = "batch"
 Robots cannot use names that begin with it.
 """
 # Version of the computations; it must be raised when a part computes another result from the same inputs.
-_FORMAT = 1
+_COMPUTATION_VERSION = 1
 # Types of arrays in results: the kind and size in bytes of numpy, and the stored byte order.
-_TYPES = {"f8": "<f8", "f4": "<f4", "i8": "<i8", "u1": "|u1"}
+_ARRAY_TYPES = {"f8": "<f8", "f4": "<f4", "i8": "<i8", "u1": "|u1"}
 Array = npt.NDArray[Any]
 
 
@@ -59,7 +59,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
     def name(self) -> str:
         """Return the name of the result in the store: the kind, and a hash of kind, inputs and arguments."""
         plain = msgspec.msgpack.encode(
-            [_FORMAT, self.kind, self.inputs, self.arguments], order="deterministic"
+            [_COMPUTATION_VERSION, self.kind, self.inputs, self.arguments], order="deterministic"
         )
         return f"{PREFIX}/parts/{self.kind}-{hashlib.sha256(plain).hexdigest()}"
 
@@ -92,7 +92,7 @@ def encode_result(result: PartResult) -> bytes:
     arrays = {}
     for name, each in result.arrays.items():
         kind = f"{each.dtype.kind}{each.dtype.itemsize}"
-        data = np.ascontiguousarray(each, dtype=_TYPES[kind]).tobytes()
+        data = np.ascontiguousarray(each, dtype=_ARRAY_TYPES[kind]).tobytes()
         arrays[name] = _Array(kind, each.shape, data)
     return msgspec.msgpack.encode(_Result(arrays=arrays, counts=dict(result.counts)), order="deterministic")
 
@@ -102,7 +102,7 @@ def decode_result(name: str, data: bytes) -> PartResult:
     try:
         plain = msgspec.msgpack.decode(data, type=_Result)
         arrays = {
-            key: np.frombuffer(each.data, dtype=_TYPES[each.type]).reshape(each.shape)
+            key: np.frombuffer(each.data, dtype=_ARRAY_TYPES[each.type]).reshape(each.shape)
             for key, each in plain.arrays.items()
         }
     except (msgspec.MsgspecError, KeyError, ValueError) as error:

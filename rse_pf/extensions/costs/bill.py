@@ -66,11 +66,11 @@ _DETAILED_METRICS = 7
 # Number of metrics that the agent of a server with robots reads in each period: robots, and servers.
 _READ_METRICS = 2
 # Number of rules of the web ACL in addition to the rate limits: one refuses burst commands without a token.
-_TOKEN_RULES = 1
+_FURTHER_ACL_RULES = 1
 # Period, in seconds, below which AWS has a higher price for alarms.
-_FAST_BELOW_S = 60
+_FAST_ALARM_PERIOD_S = 60
 # Assumed duration of one call of the canary, seconds.
-_CANARY_S = 1.0
+_CANARY_CALL_S = 1.0
 
 Needs = Literal["servers", "balancer", "always"]
 """The resources for which a line is paid: ``servers``, ``balancer`` for load balancer, firewall and
@@ -226,7 +226,7 @@ def _balancer_lines(settings: PlatformSettings, prices: Prices, load: Load) -> l
     by_bytes = load.commands_per_s * _HOUR_S * prices.command_bytes / _BYTES_OF_A_UNIT
     units = max(by_connections, by_bytes) * load.hours
     addresses = _BALANCER_ZONES * HOURS
-    rules = len(rate_rules(settings)) + _TOKEN_RULES
+    rules = len(rate_rules(settings)) + _FURTHER_ACL_RULES
     zones = zone_count(settings)
     rows = [
         ("load balancer", "load balancer", HOURS, "h", prices.balancer_per_hour),
@@ -251,13 +251,13 @@ def _standing_lines(settings: PlatformSettings, prices: Prices) -> list[CostLine
         ("monitor", "alarms for the operator", calling),
         ("scale modifier", "alarms that scale", scaling),
     ):
-        slow = float(sum(count for count, period_s in alarms if period_s >= _FAST_BELOW_S))
-        fast = float(sum(count for count, period_s in alarms if period_s < _FAST_BELOW_S))
+        slow = float(sum(count for count, period_s in alarms if period_s >= _FAST_ALARM_PERIOD_S))
+        fast = float(sum(count for count, period_s in alarms if period_s < _FAST_ALARM_PERIOD_S))
         rows.append((box, what, slow, "metrics", prices.alarm_metric_per_month))
         rows.append((box, f"{what}, of 10 s", fast, "metrics", prices.alarm_fast_metric_per_month))
     if settings.cloud.canary:
         calls = HOURS * _HOUR_S / CANARY_PERIOD_S
-        gb_s = calls * _CANARY_S * CANARY_MB / 1024
+        gb_s = calls * _CANARY_CALL_S * CANARY_MB / 1024
         rows.append(("monitor", "canary, computing", gb_s, "GB-s", prices.lambda_per_gb_s))
         rows.append(("monitor", "canary, each minute", calls / 1e6, "million", prices.lambda_per_million))
     return _lines("always", rows)

@@ -22,6 +22,7 @@ PRICES_FILE = "prices.json"
 # Age in days above which a warning calls prices stale: AWS changes some prices every year.
 STALE_DAYS = 365
 
+# File with the prices of the release.
 _TABLE_OF_THE_RELEASE = Path(__file__).with_name("prices.json")
 
 _Price = Annotated[float, msgspec.Meta(ge=0)]

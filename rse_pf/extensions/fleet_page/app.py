@@ -27,6 +27,7 @@ from rse_pf.terminal import printable
 
 __all__ = ["CONTENT_SECURITY_POLICY", "FleetApp", "PageAccess", "PageActions"]
 
+# Content security policy of the page: scripts and requests of this origin only.
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -46,6 +47,7 @@ _MAX_BODY_BYTES = 4096
 _LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 # Topics of the stream, besides "live/MAP".
 _TOPICS = frozenset(("fleet", "history", "robots", "event", "audit", "pose", "link", "maps"))
+# Beginning of the topics of live maps; the name of the map follows.
 _LIVE = "live/"
 # HTTP status of an answer by the code of its error; other codes have the status 400.
 _STATUS = {

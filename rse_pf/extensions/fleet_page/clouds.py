@@ -42,7 +42,7 @@ _MEMORY_BYTES = 2 << 30
 # Largest packed cloud, in bytes.
 _MAX_REPLY_BYTES = 32 << 20
 # Limit of the CPU time and of the wait for one cloud, in seconds.
-_CPU_S = 30.0
+_MAX_CPU_S = 30.0
 # Largest number of maps of a tenant, and of versions of a map, that are listed.
 _MAX_LISTED = 200
 
@@ -55,7 +55,7 @@ class MapPages:
         self._folder = folder
         self._processes = LimitedProcesses(
             "rse_pf.extensions.fleet_page.clouds:packer",
-            ProcessLimits(memory_bytes=_MEMORY_BYTES, cpu_s=_CPU_S, max_reply_bytes=_MAX_REPLY_BYTES),
+            ProcessLimits(memory_bytes=_MEMORY_BYTES, cpu_s=_MAX_CPU_S, max_reply_bytes=_MAX_REPLY_BYTES),
         )  # fmt: skip
         self._ready: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         self._packing = threading.Lock()
@@ -115,7 +115,7 @@ class MapPages:
         with self._packing:
             packed = self._ready.get(key)
             if packed is None:
-                packed = self._processes.call(registry.data(name, version), _CPU_S)
+                packed = self._processes.call(registry.data(name, version), _MAX_CPU_S)
                 self._ready[key] = packed
             self._ready.move_to_end(key)
             while len(self._ready) > 1 and sum(map(len, self._ready.values())) > _CACHE_BYTES:

@@ -25,8 +25,10 @@ from rse_pf.terminal import show, show_json
 
 __all__ = ["ACTION"]
 
+# Name of the platform whose page is shown by default.
 _DEFAULT_NAME = "default"
 
+# Largest TCP port.
 _MAX_PORT = 65535
 
 

@@ -19,7 +19,7 @@ __all__ = ["MAX_PAGES", "Hub"]
 MAX_PAGES = 32
 """Largest number of pages (browser windows) that are open at the same time."""
 # Number of the newest rows of each topic that a new page receives.
-_KEPT = 500
+_STORED_ROWS = 500
 # Largest number of rows that wait for a slow page; above it, the oldest rows are dropped.
 _MAX_WAITING = 2000
 # Largest number of values that are stored; above it, the oldest value is dropped.
@@ -78,7 +78,7 @@ class Hub:
         Only the last 500 rows are stored.
         """
         message = _message(topic, "", row)
-        self._rows.setdefault(topic, deque(maxlen=_KEPT)).append(message)
+        self._rows.setdefault(topic, deque(maxlen=_STORED_ROWS)).append(message)
         for page in self._pages:
             if topic in page.topics:
                 page.rows.append(message)

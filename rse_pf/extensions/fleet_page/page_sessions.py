@@ -25,11 +25,11 @@ MAX_SESSIONS = 32
 # Largest number of unused keys; above it, the oldest one becomes invalid.
 _MAX_KEYS = 64
 # A session that was not used for this long ends, in seconds.
-_IDLE_S = 12 * 3600.0
+_MAX_IDLE_S = 12 * 3600.0
 # Hint of errors about keys and sessions of users.
-_NEW_KEY = "get a new address with: rse-pf fleet"
+_NEW_KEY_HINT = "get a new address with: rse-pf fleet"
 # Hint of errors about keys of operators.
-_NEW_OPERATOR_KEY = "get one with: rse-pf fleet --operate"
+_NEW_OPERATOR_KEY_HINT = "get one with: rse-pf fleet --operate"
 
 
 @dataclass(slots=True)
@@ -63,7 +63,7 @@ class PageSessions:
         """
         role = self._take_key(key, now_s)
         if role is None:
-            raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_KEY)
+            raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_KEY_HINT)
         session = self._secret()
         self._sessions[_digest(session)] = _Session(role, now_s)
         while len(self._sessions) > MAX_SESSIONS:
@@ -80,9 +80,11 @@ class PageSessions:
         self.role_of(session, now_s=now_s)
         role = self._take_key(key, now_s)
         if role is None:
-            raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_OPERATOR_KEY)
+            raise Unauthorized(
+                "this key is unknown, was used already, or is too old", hint=_NEW_OPERATOR_KEY_HINT
+            )
         if role != "operate":
-            raise Forbidden("this key allows to view the page only", hint=_NEW_OPERATOR_KEY)
+            raise Forbidden("this key allows to view the page only", hint=_NEW_OPERATOR_KEY_HINT)
         self._sessions[_digest(session)].role = "operate"
 
     def role_of(self, session: str, *, now_s: float) -> Role:
@@ -91,18 +93,18 @@ class PageSessions:
         Raises Unauthorized if it does not exist or expired.
         """
         entry = self._sessions.get(_digest(session))
-        if entry is not None and now_s - entry.used_s > _IDLE_S:
+        if entry is not None and now_s - entry.used_s > _MAX_IDLE_S:
             del self._sessions[_digest(session)]
             entry = None
         if entry is None:
-            raise Unauthorized("this page has no session", hint=_NEW_KEY)
+            raise Unauthorized("this page has no session", hint=_NEW_KEY_HINT)
         entry.used_s = now_s
         return entry.role
 
     def check_operator(self, session: str, *, now_s: float) -> None:
         """Raise Forbidden if the role of *session* is "view", Unauthorized if there is no such session."""
         if self.role_of(session, now_s=now_s) != "operate":
-            raise Forbidden("only an operator may do this", hint=_NEW_OPERATOR_KEY)
+            raise Forbidden("only an operator may do this", hint=_NEW_OPERATOR_KEY_HINT)
 
     def _take_key(self, key: str, now_s: float) -> Role | None:
         role, until_s = self._keys.pop(_digest(key), (None, 0.0))

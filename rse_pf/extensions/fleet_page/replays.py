@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Replays", "replay_document"]
 
 # Longest time until an answered command is written to the recording, in seconds.
-_WRITTEN_S = 2.0
+_MAX_WRITE_DELAY_S = 2.0
 # Largest image of a replay that is sent to the page, in bytes.
 _MAX_PICTURE_BYTES = 2 << 20
 
@@ -61,8 +61,8 @@ class Replays:
             raise Busy("another replay is under way", hint="try again in a moment", retry_after_ms=1000)
         async with self._lock:
             age_s = self._wall_clock() - answered_s
-            if 0 <= age_s < _WRITTEN_S:
-                await asyncio.sleep(_WRITTEN_S - age_s)
+            if 0 <= age_s < _MAX_WRITE_DELAY_S:
+                await asyncio.sleep(_MAX_WRITE_DELAY_S - age_s)
             size = query.get("bytes", "")
             command_bytes = int(size) if size.isascii() and size.isdigit() and len(size) < 10 else None
             reply = await asyncio.to_thread(

@@ -28,13 +28,14 @@ __all__ = ["ANNOUNCEMENT", "listen", "page_url", "serve_page"]
 
 ANNOUNCEMENT = "fleet_page.json"
 """Name of the file with pid and port of the page, in the folder of the platform's state."""
+# Address at which the page listens.
 _LOOPBACK = "127.0.0.1"
 # Largest number of connections that have sent no request yet, and the same of idle ones after a request.
 _MAX_SILENT = 2 * MAX_PAGES
 # Largest number of all connections.
 _MAX_CONNECTIONS = 4 * MAX_PAGES + 2 * _MAX_SILENT
 # Longest wait for open requests when the server stops, in seconds.
-_LONGEST_END_S = 1
+_STOP_TIMEOUT_S = 1
 
 
 def page_url(port: int, key: str) -> str:
@@ -96,7 +97,7 @@ def serve_page(
         app, http=bounded_protocol(most=_MAX_SILENT, most_idle=_MAX_SILENT), ws="none", lifespan="off",
         access_log=False, log_level="critical",
         limit_concurrency=_MAX_CONNECTIONS, server_header=False, date_header=False, proxy_headers=False,
-        timeout_graceful_shutdown=_LONGEST_END_S, h11_max_incomplete_event_size=16384,
+        timeout_graceful_shutdown=_STOP_TIMEOUT_S, h11_max_incomplete_event_size=16384,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         # uvicorn handles the signals while it serves, and raises them again after it has stopped: without

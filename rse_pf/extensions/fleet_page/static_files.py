@@ -11,6 +11,7 @@ from typing import Any
 
 __all__ = ["STATIC", "StaticFile", "page_files", "vendored"]
 
+# Folder of the static files.
 STATIC = Path(__file__).parent / "static"
 # Media types of the files that are served, by suffix; files with other suffixes are not served.
 _TYPES = {

@@ -24,13 +24,13 @@ __all__ = ["Tracks", "distinct_cameras", "find_tracks"]
 
 Rows = npt.NDArray[np.int64]
 
-_NEXT_KEYFRAMES = 3
+_MATCHED_FOLLOWERS = 3
 """Number of the following keyframes of the same robot with which each keyframe is matched."""
 _OUTLIER_PX = 4.0
 """Largest reprojection error in pixels of a match and of an observation, and the width of the Huber loss of
 the triangulation; COLMAP filters its own models by the same limit."""
 # Iterations of each triangulation: one with measured points alone, then three with pixels as well.
-_ROUNDS = 4
+_TRIANGULATION_ITERATIONS = 4
 _OUTLIER_ROUNDS = 2
 """Number of rounds, each of which triangulates the points and then removes outliers; one more triangulation
 follows the last round."""
@@ -134,7 +134,7 @@ def _keyframe_pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
         by_robot.setdefault(keyframe.robot, []).append(index)
     for indices in by_robot.values():
         indices.sort(key=lambda index: (version.keyframes[index].timestamp_s, index))
-        for distance in range(1, _NEXT_KEYFRAMES + 1):
+        for distance in range(1, _MATCHED_FOLLOWERS + 1):
             pairs.update(dict.fromkeys(zip(indices, indices[distance:], strict=False)))
     index_of_id = {keyframe.id: index for index, keyframe in enumerate(version.keyframes)}
     for edge in version.edges:
@@ -278,7 +278,7 @@ def _triangulate(features: _Features, row: Rows, point: Rows) -> Array:
     centres = inverse(features.T_camera_world)[keyframe, :3, 3]
     rays = np.einsum("mji,mj->mi", features.T_camera_world[keyframe, :3, :3], features.ray[row])
     ray_weights = np.zeros(len(row))
-    for _ in range(_ROUNDS):
+    for _ in range(_TRIANGULATION_ITERATIONS):
         points = triangulate_rays(
             centres, rays, ray_weights, features.measured_point[row], features.weight[row], point, count
         )

@@ -35,7 +35,9 @@ SUFFIX: Final = ".mcap"  # ending of the names of files
 
 WIRE_ENCODING: Final = "rse-pf-wire"
 """Message encoding of the channels that hold the bytes of WebSocket messages as they were sent."""
+# Message encoding of the channels with JSON messages.
 JSON_ENCODING: Final = "json"
+# Encoding of the schemas of JSON messages.
 JSON_SCHEMA_ENCODING: Final = "jsonschema"
 
 EVENTS_TOPIC: Final = "/platform/events"  # events of the platform, and of the recorder itself
@@ -45,6 +47,7 @@ FRAMES_PREFIX: Final = "/frames/"  # thumbnails of a robot's frames; its pseudon
 ODOMETRY_PREFIX: Final = "/odometry/"  # odometry poses of a robot's frames; its pseudonym follows
 MAP_TOPIC: Final = "/map"  # points of the maps of a robot
 
+# Names of the schemas of JSON messages.
 EVENT_SCHEMA: Final = "rse_pf.Event"
 SAMPLE_SCHEMA: Final = "rse_pf.Sample"
 ODOMETRY_SCHEMA: Final = "rse_pf.Odometry"
@@ -55,11 +58,14 @@ IMAGE_SCHEMA: Final = "foxglove.CompressedImage"
 Direction = Literal["up", "down"]
 """Direction of a message: ``up`` from the robot to the server, ``down`` from the server to the robot."""
 
-_WIRE_TOPIC = re.compile(r"/wire/([0-9a-f]{16})/(up|down)")  # connection and direction
-_FILE_NAME = re.compile(r"(\d{8}T\d{6}Z)-(.+)-(\d{4,})")  # start, server and number, without the suffix
-_NOT_FOR_A_FILE = re.compile(r"[^A-Za-z0-9_.-]")  # characters of a server's name that a file name replaces
+_WIRE_TOPIC = re.compile(r"/wire/([0-9a-f]{16})/(up|down)")  # topic of a channel: connection and direction
+_FILE_NAME = re.compile(
+    r"(\d{8}T\d{6}Z)-(.+)-(\d{4,})"
+)  # name of a file without its suffix: start, server, number
+# Characters of a server's name that are replaced in the name of a file.
+_REPLACED_CHARACTERS = re.compile(r"[^A-Za-z0-9_.-]")
 _MAX_SERVER_LETTERS = 64  # largest number of characters of a server's name in a file name
-_TIME_FORMAT = "%Y%m%dT%H%M%SZ"  # the start of the recorder in a file name, UTC
+_TIME_FORMAT = "%Y%m%dT%H%M%SZ"  # format of the start of the recorder in a file name, UTC
 
 
 class WireChannel(NamedTuple):
@@ -92,7 +98,7 @@ class FileName(NamedTuple):
     def __str__(self) -> str:
         """Return the name with its suffix, ``START-SERVER-NNNN.mcap``, START in UTC."""
         started = self.started.astimezone(timezone.utc).strftime(_TIME_FORMAT)
-        server = _NOT_FOR_A_FILE.sub("_", self.server)[:_MAX_SERVER_LETTERS] or "_"
+        server = _REPLACED_CHARACTERS.sub("_", self.server)[:_MAX_SERVER_LETTERS] or "_"
         return f"{started}-{server}-{self.number:04d}{SUFFIX}"
 
     @classmethod
@@ -143,6 +149,7 @@ def _object(**properties: Any) -> dict[str, Any]:
     return {"type": "object", "properties": properties}
 
 
+# Parts of JSON schemas.
 _NUMBER: Final = {"type": "number"}
 _INTEGER: Final = {"type": "integer"}
 _TEXT: Final = {"type": "string"}

@@ -24,6 +24,7 @@ _MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 # A message record: opcode, length, channel, sequence number, log time and publish time (ns); the data
 # follows.
 _MESSAGE = struct.Struct("<BQHIQQ")
+# Size of a message record without its data.
 _MESSAGE_BYTES = _MESSAGE.size
 _MESSAGE_FIELDS = _MESSAGE_BYTES - 9  # size of the fields of a chunk record without opcode (1) and length (8)
 _pack_message = _MESSAGE.pack

@@ -20,7 +20,7 @@ __all__ = ["WORLD_FRAME", "image", "inverse", "point_cloud", "pose_in_frame", "r
 
 WORLD_FRAME = "world"
 """Name of the coordinate frame of the points in a robot's commands."""
-_FLOAT32 = 7  # value of FLOAT32 in Foxglove's NumericType
+_FLOAT32 = 7  # number of the type FLOAT32 in Foxglove's NumericType
 _NS = 1_000_000_000  # nanoseconds of a second
 _POINT_BYTES = 12  # bytes of a point: x, y and z as float32
 # Format of `struct` for the numbers of a MessagePack extension of the codec ``bin``, by its type.

@@ -63,13 +63,14 @@ the processor to a worker."""
 _READ_INTERVAL_S = 0.1
 """Pause, seconds, after the pipes were read empty: waking up for each message costs more than its work."""
 _FLUSH_INTERVAL_S = 0.2  # longest time, seconds, between two calls of `RecordingWriter.flush`
-_MAX_FDS = 4  # largest number of file descriptors that are received with one message
+_MAX_RECEIVED_FDS = 4  # largest number of file descriptors that are received with one message
+# How a recorder process is started.
 _CHILD = ChildPlan(
     target=f"{__name__}:run", name="rse-pf recorder", policy="batch", nice=5, outlives_parent=True
 )
 # kinds whose id, texts or pose were decoded by a worker
 _DECODED_KINDS = frozenset({DECODED_COMMAND, ANSWER_WITH_POSE})
-_HEX_BYTES = 8  # random bytes of the identifier of a connection, 16 hex digits
+_CONNECTION_ID_BYTES = 8  # random bytes of the identifier of a connection, 16 hex digits
 
 
 class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
@@ -140,7 +141,7 @@ class MessageRecorder:
             self._codecs[codec], robot, self._pseudonyms,
             max_inflated_bytes=self._session.max_inflated_bytes, secrets=secrets_,
         )  # fmt: skip
-        identity = secrets.token_hex(_HEX_BYTES)
+        identity = secrets.token_hex(_CONNECTION_ID_BYTES)
         return RecordedConnection(redactor, identity=identity, codec=codec, server=self._server)
 
     def take(self, connection: RecordedConnection, direction: Direction, time_ns: int, data: bytes) -> None:
@@ -329,7 +330,7 @@ def _take_pipes(
     Once no worker has the other end of *from_workers*, this socket is removed from *selector*.
     """
     try:
-        data, fds, _, _ = socket.recv_fds(from_workers, 1, _MAX_FDS)
+        data, fds, _, _ = socket.recv_fds(from_workers, 1, _MAX_RECEIVED_FDS)
     except BlockingIOError:
         return
     except OSError:

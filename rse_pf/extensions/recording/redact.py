@@ -34,9 +34,9 @@ _PSEUDONYM_DIGITS = 8  # number of hex digits of a pseudonym
 # Largest number of commands of a connection whose answers are awaited: bounds the memory.
 _MAX_OPEN_COMMANDS = 4096
 # Types of messages from robots, apart from commands, that are recorded.
-_ALWAYS_UP = frozenset({"hello", "ping", "cancel"})
+_RECORDED_FROM_ROBOT = frozenset({"hello", "ping", "cancel"})
 # Types of messages from servers that are recorded although they answer no command.
-_ALWAYS_DOWN = frozenset({"move", "pong", "renewed"})
+_RECORDED_FROM_SERVER = frozenset({"move", "pong", "renewed"})
 _TEXT_FIELDS = ("trace", "stream", "message", "hint", "what", "reason", "sdk")  # fields with free texts
 _VALUE_FIELDS = ("payload", "reply")  # fields with values of a service, in which `PROTOCOL_WORDS` stay
 PROTOCOL_WORDS = frozenset({
@@ -158,7 +158,7 @@ class ConnectionRedactor:
                 kind, identity, service = head.type, head.id or 0, head.service
             if kind == "command" and service in NAME_FREE_SERVICES:
                 self._remember(identity, service)
-            elif kind not in _ALWAYS_UP:
+            elif kind not in _RECORDED_FROM_ROBOT:
                 return self._leave_out()
             stored = self._without_names(data, text, kind, service, from_robot=True)
         except _UNDECODABLE:
@@ -202,7 +202,7 @@ class ConnectionRedactor:
                     return self._leave_out()
                 if head.type != "progress":
                     del self._open[head.id or 0]
-            elif head.type not in _ALWAYS_DOWN and head.type != "failure":
+            elif head.type not in _RECORDED_FROM_SERVER and head.type != "failure":
                 return self._leave_out()
             stored = self._without_names(data, text, head.type, service, from_robot=False)
         except _UNDECODABLE:

@@ -89,6 +89,7 @@ class _MapEntry(NamedTuple):
     points: bytes
 
 
+# An entry of the queue of the recorder.
 _Entry = _MessageEntry | _OpenEntry | _CloseEntry | _FrameEntry | _MapEntry
 
 

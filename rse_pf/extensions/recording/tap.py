@@ -28,14 +28,15 @@ __all__ = [
     "split_decoded_command",
 ]  # fmt: skip
 
-# Kinds of the entries that a worker writes to the recorder:
-OPENED = 1  # a connection was opened
-UP = 2  # a message was received from a robot
-DOWN = 3  # a message was sent to a robot
-CLOSED = 4  # a connection was closed
-LOST = 5  # messages were dropped; the data are their total number
-DECODED_COMMAND = 6  # as UP, for a command: its id and free texts precede the message
-ANSWER_WITH_POSE = 7  # as DOWN, for a result with a pose: command id and pose precede the message
+# Kinds of the entries that a worker writes to the recorder process:
+OPENED = 1  # kind of entry: a connection was opened
+UP = 2  # kind of entry: a message was received from a robot
+DOWN = 3  # kind of entry: a message was sent to a robot
+CLOSED = 4  # kind of entry: a connection was closed
+LOST = 5  # kind of entry: messages were dropped; the data are their total number
+DECODED_COMMAND = 6  # kind of entry: as UP, for a command whose id and free texts precede the message
+# Kind of entry: as DOWN, for a result whose command id and pose precede the message.
+ANSWER_WITH_POSE = 7
 _ENTRY = struct.Struct("<BIQI")
 """Head of an entry: its kind, the number of the connection, the Unix time in ns, and the number of bytes of
 data that follow."""

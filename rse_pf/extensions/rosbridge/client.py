@@ -46,9 +46,9 @@ _MAX_AUTH_BYTES = 8192
 # Largest number of messages of a client that has not sent its token; then it is closed.
 _MAX_WITHOUT_TOKEN = 10
 # Pause before a client with a rejected token is closed, in seconds, so that an address can try few tokens.
-_REFUSED_S = 1.0
+_REJECTION_PAUSE_S = 1.0
 # Time, in ms, after which a client with too many unanswered calls may try again; stated in the error.
-_BUSY_MS = 200.0
+_BUSY_RETRY_MS = 200.0
 # Levels of ``set_level`` with which a client receives status messages about errors.
 _ERROR_LEVELS = ("error", "warning", "info")
 
@@ -103,7 +103,7 @@ class Client:
                 identity = self._identity = self._identify()
             except RsePfError as error:
                 await self._robot.close()
-                await asyncio.sleep(_REFUSED_S)
+                await asyncio.sleep(_REJECTION_PAUSE_S)
                 await self._end(error)
                 return
             authenticated()
@@ -272,7 +272,7 @@ class Client:
             raise Busy(
                 f"{len(self._tasks)} calls of this robot are unanswered",
                 hint="wait for answers before sending more",
-                retry_after_ms=_BUSY_MS,
+                retry_after_ms=_BUSY_RETRY_MS,
             )
         self._spawn(self._call(name, call))
 

@@ -37,9 +37,11 @@ _UNSUPPORTED = {
     "unadvertise_service": "services of robots are",
     "service_response": "services of robots are",
 }
+# Hint of errors about malformed operations.
 _PAGE = "compare it with docs/rosbridge.md"
 
 Name = Annotated[str, msgspec.Meta(max_length=256)]
+# The id of an operation, which its answer repeats.
 Identity = Annotated[str, msgspec.Meta(max_length=256)] | int | None
 
 
@@ -96,7 +98,9 @@ class _Publication(msgspec.Struct, frozen=True):
 
 _encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
 _decode = msgspec.json.Decoder(Operation).decode
+# Exceptions of a message that cannot be decoded.
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError)
+# Exceptions of a value that cannot be encoded as JSON.
 _UNENCODABLE = (RecursionError, ValueError, TypeError, OverflowError)
 
 

@@ -40,7 +40,7 @@ __all__ = ["open_rosbridge", "serve_rosbridge"]
 # limit of all.
 _HANDSHAKES_PER_S = 20.0
 # Longest time from the handshake until the platform has accepted a client's token, in seconds.
-_TOKEN_S = 5.0
+_TOKEN_TIMEOUT_S = 5.0
 
 
 class _Clients:
@@ -56,7 +56,7 @@ class _Clients:
         rate = min(_HANDSHAKES_PER_S, serving.max_handshakes_per_source_per_s)
         self._rates = SourceRates(settings.replace(serving={"max_handshakes_per_source_per_s": rate}).serving)
         self._silent: SilentConnections[ServerConnection] = SilentConnections(
-            call_later=asyncio.get_running_loop().call_later, seconds=_TOKEN_S,
+            call_later=asyncio.get_running_loop().call_later, seconds=_TOKEN_TIMEOUT_S,
             most=serving.max_unauthenticated, most_per_source=serving.max_unauthenticated_per_source,
         )  # fmt: skip
         self._closing: set[asyncio.Task[None]] = set()

@@ -28,6 +28,7 @@ MAX_LATCHED_BYTES = 4 << 20
 # Longest time between two messages of a subscription (``throttle_rate``), in seconds; longer ones are
 # shortened.
 _MAX_PAUSE_S = 3600.0
+# Pattern of the names of topics.
 _NAME = re.compile(r"/?[A-Za-z~][A-Za-z0-9_~.-]{0,127}(?:/[A-Za-z0-9_~.-]{1,128}){0,16}")
 
 Key = tuple[str, str]

@@ -38,6 +38,7 @@ SLOTS = ("features", "motion", "loops", "optimiser")
 """Functions that a Python file may set; each is the argument of `Mapper` of the same name."""
 # Names of the options that the file of a configuration may set.
 _OPTIONS = ("base", "depth", "frontend", "monocular")
+# Pattern of the built-in configuration ``features-N``, with N features.
 _FEATURES = re.compile(r"features-(\d{1,6})")
 # Smallest N of ``features-N``.
 _MIN_FEATURES = 50

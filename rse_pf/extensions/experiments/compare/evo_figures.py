@@ -17,13 +17,15 @@ from client_sdk.trajectory_error import Accuracy
 
 __all__ = ["evo_ate_cm", "evo_command"]
 
+# The program of evo that computes the ATE.
 _COMMAND = "evo_ape"
+# The line of evo's output with the root mean square error.
 _RMSE = re.compile(r"^\s*rmse\s+([0-9.eE+-]+)\s*$", re.MULTILINE)
 # Time limit of one run of evo, in seconds.
-_WAIT_S = 60.0
+_EVO_TIMEOUT_S = 60.0
 # Largest difference, in seconds, of two time stamps that evo takes for equal; both files that we write have
 # equal stamps.
-_SAME_S = "0.001"
+_EQUAL_STAMPS_S = "0.001"
 
 
 def evo_command() -> str | None:
@@ -44,10 +46,10 @@ def evo_ate_cm(command: str, errors: Accuracy) -> float | None:
         truth, estimate = Path(name) / "truth.txt", Path(name) / "estimate.txt"
         write_trajectory(truth, errors.truth)
         write_trajectory(estimate, errors.compared)
-        words = [command, "tum", str(truth), str(estimate), "--align", "--t_max_diff", _SAME_S]
+        words = [command, "tum", str(truth), str(estimate), "--align", "--t_max_diff", _EQUAL_STAMPS_S]
         words += [] if errors.has_unit else ["--correct_scale"]
         try:
-            done = subprocess.run(words, capture_output=True, text=True, timeout=_WAIT_S, check=False)
+            done = subprocess.run(words, capture_output=True, text=True, timeout=_EVO_TIMEOUT_S, check=False)
         except (OSError, subprocess.TimeoutExpired):
             return None
     found = _RMSE.search(done.stdout)

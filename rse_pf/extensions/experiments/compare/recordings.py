@@ -15,11 +15,12 @@ from rse_pf.errors import UsageError
 
 __all__ = ["Drive", "drives_of", "open_recording"]
 
+# Pattern of the name of a rendered world, with its seed.
 _WORLD = re.compile(r"world:(\d{1,9})")
 # Number of frames of a rendered world.
 _WORLD_FRAMES = 80
 # Ratio of a requested rate to that of the recording above which the rate is reported as too high.
-_ABOVE = 1.05
+_MAX_RATE_RATIO = 1.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,7 +91,7 @@ def _at_rates(dataset: Dataset, rates_hz: Sequence[float]) -> list[Drive]:
     drives: list[Drive] = []
     for rate_hz in rates_hz or (own_hz,):
         notes = dataset.notes
-        if rate_hz > _ABOVE * own_hz:
+        if rate_hz > _MAX_RATE_RATIO * own_hz:
             notes = (
                 *notes,
                 f"--rate {rate_hz:g} is above the recording's {own_hz:.3g} Hz: all frames are played",

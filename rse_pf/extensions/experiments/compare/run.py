@@ -34,9 +34,9 @@ from rse_pf.terminal import show, show_progress
 
 __all__ = ["CompareOptions", "run_compare"]
 
-REPORT = "compare.json"
-PICTURE = "compare.png"
-TRAJECTORIES = "trajectories"
+REPORT = "compare.json"  # name of the file with the report
+PICTURE = "compare.png"  # name of the file with the image of the trajectories
+TRAJECTORIES = "trajectories"  # name of the folder with the trajectories
 # Characters of names that are replaced by "_" in file names.
 _NOT_PLAIN = re.compile(r"[^\w.-]")
 

@@ -28,7 +28,9 @@ from rse_pf.wire.server_codec import make_server_codec
 
 __all__ = ["InProcessSolver", "MeteredSolver", "PlatformSolver", "platform_solver"]
 
+# Codec of the commands.
 _CODEC = "zlib"
+# Name of the robot that asks for poses.
 _ROBOT = "compare"
 
 

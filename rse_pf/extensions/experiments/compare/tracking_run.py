@@ -26,9 +26,9 @@ __all__ = ["TrackingRun", "longest_gap_s", "score", "track"]
 # Name of the robot in the keyframes of a run.
 _ROBOT = "compare"
 # Number of the first segment; only its poses count for the errors of online poses.
-_FIRST = 0
+_FIRST_SEGMENT = 0
 # Smallest number of poses of a run from which errors are computed.
-_FEWEST = 3
+_MIN_POSES = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,9 +139,9 @@ def score(
     truth = drive.dataset.truth
     if truth is None or len(truth) < 2:
         return None, "the recording has no truth: no ATE, no RPE"
-    if len(estimate) < _FEWEST:
+    if len(estimate) < _MIN_POSES:
         posed = f"{len(estimate)} of {len(drive.dataset)} frames have a pose"
-        return None, f"{posed}, an evaluation needs {_FEWEST}"
+        return None, f"{posed}, an evaluation needs {_MIN_POSES}"
     try:
         return accuracy(estimate, truth, with_scale=not is_metric, T_body_camera=T_body_camera), ""
     except UsageError as error:
@@ -162,7 +162,9 @@ def _run_of(
     if mapper.start_reason:
         why = f"no frame has a pose: {mapper.start_reason}"
     arrived = [
-        (stamp_s, pose) for stamp_s, segment, pose in tracked if segment == _FIRST and pose is not None
+        (stamp_s, pose)
+        for stamp_s, segment, pose in tracked
+        if segment == _FIRST_SEGMENT and pose is not None
     ]
     online = None
     if arrived:

@@ -23,7 +23,7 @@ __all__ = ["LIVE_NAME", "LiveRecorder", "fetch_live_map", "show_live_map"]
 LIVE_NAME = "demo"
 """Name of the demo's live map."""
 # Deadline of the commands ``live-publish`` and ``live-show``, in seconds.
-_PUBLISH_S = 60.0
+_PUBLISH_DEADLINE_S = 60.0
 
 
 class LiveRecorder:
@@ -98,7 +98,7 @@ async def fetch_live_map(url: str, token: str, folder: Path, session: SessionSet
 
     try:
         async with connect(url, token=token, settings=session) as operator:
-            answer = await operator.call("live-publish", {"map": LIVE_NAME}, deadline_s=_PUBLISH_S)
+            answer = await operator.call("live-publish", {"map": LIVE_NAME}, deadline_s=_PUBLISH_DEADLINE_S)
         await asyncio.to_thread(_download, url, token, str(answer.reply["version"]), folder)
     except RsePfError as error:
         return f"{error.code}: {error.message}"
@@ -114,7 +114,7 @@ async def show_live_map(url: str, token: str, session: SessionSettings) -> dict[
 
     try:
         async with connect(url, token=token, settings=session) as operator:
-            answer = await operator.call("live-show", {"map": LIVE_NAME}, deadline_s=_PUBLISH_S)
+            answer = await operator.call("live-show", {"map": LIVE_NAME}, deadline_s=_PUBLISH_DEADLINE_S)
     except RsePfError as error:
         return {"trouble": f"{error.code}: {error.message}"}
     reply = answer.reply

@@ -41,15 +41,15 @@ LIVE_FAULTS = {
 # Percentage of the operations of the object store that fail during the fault "store".
 _FAILING_PERCENT = 30.0
 # Earliest time of a fault, as a fraction of the drive.
-_EARLIEST = 0.16
+_EARLIEST_FAULT = 0.16
 # Latest time of a fault, as a fraction of the drive; a long fault begins in the first half of the interval.
-_LATEST = 0.5
+_LATEST_FAULT = 0.5
 # Duration, in seconds, above which a fault is a long one.
-_LONG_S = 20.0
+_LONG_FAULT_S = 20.0
 # Time between two reads of the map's lease, in seconds.
-_WATCH_S = 0.02
-# Longest wait until a server serves the map, in seconds.
-_OWNER_S = 20.0
+_LEASE_POLL_S = 0.02
+# Longest wait until a map server serves the map, in seconds.
+_MAP_SERVER_TIMEOUT_S = 20.0
 # Number (from 0) of the robot whose link the fault "wifi" cuts.
 _CUT_ROBOT = 0
 # During the fault "wifi", a robot solves a pose itself if the cloud has not answered within this time, in
@@ -83,8 +83,10 @@ class LiveFault:
 
     def moment_s(self, drive_s: float) -> float:
         """Return the time at which the fault begins in a drive of *drive_s*; both in seconds."""
-        latest = (_EARLIEST + _LATEST) / 2 if LIVE_FAULTS[self.name] > _LONG_S else _LATEST
-        return drive_s * random.Random(self.seed).uniform(_EARLIEST, latest)
+        latest = (
+            (_EARLIEST_FAULT + _LATEST_FAULT) / 2 if LIVE_FAULTS[self.name] > _LONG_FAULT_S else _LATEST_FAULT
+        )
+        return drive_s * random.Random(self.seed).uniform(_EARLIEST_FAULT, latest)
 
     def environment(self, folder: Path) -> contextlib.AbstractContextManager[None]:
         """Return the environment in which the platform must be started; for "store", its stores can fail."""
@@ -212,10 +214,10 @@ class Disturbance:
         Raises:
             CommandFailed: No map server served the map within 20 s.
         """
-        for _ in range(round(_OWNER_S / _WATCH_S)):
+        for _ in range(round(_MAP_SERVER_TIMEOUT_S / _LEASE_POLL_S)):
             if self._lease is not None and self._lease.state == "serving":
                 return self._lease
-            await asyncio.sleep(_WATCH_S)
+            await asyncio.sleep(_LEASE_POLL_S)
         raise CommandFailed("no server serves the live map", hint="let the robots drive for longer")
 
     async def _watch(self) -> None:
@@ -233,4 +235,4 @@ class Disturbance:
                         state=record.state,
                         epoch=record.epoch,
                     )
-            await asyncio.sleep(_WATCH_S)
+            await asyncio.sleep(_LEASE_POLL_S)

@@ -46,14 +46,14 @@ __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"
 # Niceness of the processes of robots: they share the machine with the servers, which must have priority.
 _ROBOT_NICE = 5
 # Smallest number of measurements of a point that is written to the cloud.
-_MIN_READINGS = 2
+_MIN_MEASUREMENTS = 2
 # Time, in seconds, before the deadline of a command at which a robot begins to solve the pose itself; long,
 # because all robots and servers share one machine.
-_OWN_SOLVER_S = 0.2
+_OWN_SOLUTION_LEAD_S = 0.2
 # Number of frames of each robot in the rendered world.
 _DEFAULT_FRAMES = 80
 # Number of frames of each robot in the rendered world if the maps of the robots are merged.
-_LEAST_MERGE_FRAMES = 150
+_MERGED_FRAMES = 150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +97,7 @@ class DemoOptions:
 
         if self.frames or not (self.merge or self.live):
             return self.frames or _DEFAULT_FRAMES
-        return max(_LEAST_MERGE_FRAMES, frames_to_overlap(self.robots))
+        return max(_MERGED_FRAMES, frames_to_overlap(self.robots))
 
     def share(self, robot: int) -> Dataset:
         """Return the part of the recording that the robot of number *robot* (from 0) plays.
@@ -224,7 +224,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     async def token() -> str:
         return await asyncio.to_thread(pipe.fresh_token)
 
-    offload = CloudFirst(slack_s=_OWN_SOLVER_S) if spec.has_offload else None
+    offload = CloudFirst(slack_s=_OWN_SOLUTION_LEAD_S) if spec.has_offload else None
     async with connect(
         spec.url, token=token, codec=options.codec, settings=spec.session, offload=offload
     ) as robot:
@@ -399,7 +399,7 @@ def _write(
     folder: Path, mapper: Mapper | LiveMapper, trajectory: Trajectory, truth: Trajectory | None
 ) -> None:
     """Write cloud and trajectory of the robot, and its truth if that is known."""
-    points, colours = mapper.map.points(min_readings=_MIN_READINGS)
+    points, colours = mapper.map.points(min_readings=_MIN_MEASUREMENTS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(
         folder / "trajectory.txt",

@@ -71,10 +71,10 @@ T = TypeVar("T")
 # Time after which the process of a robot that has finished and does not exit is killed, in seconds.
 _EXIT_TIMEOUT_S = 5.0
 # Time between the order to start and the start of the robots, in seconds.
-_START_S = 0.2
+_START_DELAY_S = 0.2
 # Time between the order to start and the start with a live map, in seconds: the map server starts and robots
 # join.
-_LIVE_START_S = 3.0
+_LIVE_START_DELAY_S = 3.0
 
 
 @dataclass(slots=True, kw_only=True)
@@ -215,7 +215,7 @@ async def _follow(
         frames={robot.spec.name: message.frames for robot, message in zip(robots, ready, strict=True)},
         **({} if disturbance is None else disturbance.parameters),
     )
-    start_after_s = _LIVE_START_S if options.live else _START_S
+    start_after_s = _LIVE_START_DELAY_S if options.live else _START_DELAY_S
     began = time.monotonic() + start_after_s
     harness.log("robots-start", robots=len(robots), after_s=start_after_s)
     screen.print("the robots start")

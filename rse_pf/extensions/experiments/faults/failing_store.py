@@ -29,7 +29,9 @@ __all__ = ["failing_environment", "install", "set_failing_percent"]
 _VARIABLE = "RSE_PF_FAILING_STORE"
 # Name of the file with the percentage of operations that fail.
 _PERCENT_FILE = "percent"
+# Methods of `DirectoryStore` that read, and fail before they are carried out.
 _READS = ("get", "head")
+# Methods of `DirectoryStore` that write; half of the failing ones are carried out before.
 _WRITES = ("put", "put_pieces", "compare_and_swap", "delete")
 # Source text of ``sitecustomize.py``, which Python runs when an interpreter starts.
 _SITE = "from rse_pf.extensions.experiments.faults.failing_store import install\n\ninstall()\n"

@@ -32,17 +32,18 @@ __all__ = [
     "retransmitted_s",
 ]
 
+# Address at which an emulated link listens.
 _LOOPBACK = "127.0.0.1"
 # Shortest delay of a link with jitter, in seconds, unless its nominal delay is shorter.
-_MIN_S = 0.001
+_MIN_DELAY_S = 0.001
 # A direction of a connection reads no more from its source while it holds more than this many undelivered
 # bytes.
-_HELD_BYTES = 1 << 20
+_MAX_UNDELIVERED_BYTES = 1 << 20
 # Length of the queue of connections that wait to be accepted.
 _BACKLOG = 1024
 # Number of connections that the link opens to itself during a cut: one fills the listener's queue of length
 # one, the other is spare.
-_FILLERS = 2
+_FILLING_CONNECTIONS = 2
 # Time until TCP on Linux retransmits a lost segment, in seconds; it doubles with each further retransmission.
 _FIRST_RETRY_S = 0.2
 # Time until TCP on Linux retransmits the first segment of a connection (SYN), in seconds; it doubles as well.
@@ -82,6 +83,7 @@ class LinkProfile:
         return self.up_s + self.down_s
 
 
+# The link profiles by name.
 PROFILES = {
     "none": LinkProfile(name="none", up_s=0.0, down_s=0.0),
     # RSE-PF paper, Sect. 6.1, Shenzhen to Seoul: the mean round trip minus the compute time is near 130 ms.
@@ -141,7 +143,7 @@ class Lane:
         if self._bytes_per_s is not None:
             self._sent_s += size / self._bytes_per_s
         late_s = self._random.uniform(-self._jitter_s, self._jitter_s) if self._jitter_s else 0.0
-        delay_s = max(min(self._delay_s, _MIN_S), self._delay_s + late_s)
+        delay_s = max(min(self._delay_s, _MIN_DELAY_S), self._delay_s + late_s)
         self._last_s = max(self._last_s, self._sent_s + delay_s)
         return self._last_s
 
@@ -245,7 +247,7 @@ class EmulatedLink:
         self._accept()
         self.loop.remove_reader(self._listener)
         self._listener.listen(0)
-        for _ in range(_FILLERS):
+        for _ in range(_FILLING_CONNECTIONS):
             filler = socket.socket()
             filler.setblocking(False)
             filler.connect_ex((_LOOPBACK, self.port))
@@ -324,7 +326,7 @@ class _Way:
         due = math.inf if self._opens_s is None else self._lane.arrival_s(max(now, self._opens_s), size)
         self._queue.append((due, now, data))
         self._held += size
-        if self._held > _HELD_BYTES and self.source is not None and self.source.is_reading():
+        if self._held > _MAX_UNDELIVERED_BYTES and self.source is not None and self.source.is_reading():
             self.source.pause_reading()
         self._arm()
 
@@ -382,7 +384,11 @@ class _Way:
             self._held -= len(data)
             if not self.sink.is_closing():
                 self.sink.write(data)
-        if self._held <= _HELD_BYTES // 2 and self.source is not None and not self.source.is_closing():
+        if (
+            self._held <= _MAX_UNDELIVERED_BYTES // 2
+            and self.source is not None
+            and not self.source.is_closing()
+        ):
             self.source.resume_reading()  # has no effect if reading is not paused
         self._arm()
 
@@ -432,7 +438,7 @@ class _RobotEnd(_End):
         if self.out not in link.ways:  # the link is closed
             return
         if link.is_cut:
-            again = retransmitted_s(accepted_s, link.loop.time() + _MIN_S, _FIRST_DIAL_RETRY_S)
+            again = retransmitted_s(accepted_s, link.loop.time() + _MIN_DELAY_S, _FIRST_DIAL_RETRY_S)
             link.at(again, self._dial, accepted_s)
         elif self.out.source is not None and not self.out.source.is_closing():
             self.out.open(link.loop.time() + link.profile.down_s)

@@ -19,12 +19,12 @@ from rse_pf.wire.preencoded import PreencodedCommand, preencode
 __all__ = ["SolvedPayload", "is_right", "make_payloads"]
 
 # Number of different payloads that a load repeats: enough that caches of servers have no effect.
-_POOL = 64
+_DIFFERENT_PAYLOADS = 64
 # Largest distance, in metres, of the camera centre of a correct pose from the truth; with 200 matches the
 # error is one or two centimetres.
-_POSE_M = 0.05
+_MAX_POSITION_ERROR_M = 0.05
 # Largest rotation, in radians, of a correct pose relative to the truth.
-_POSE_RAD = math.radians(1.0)
+_MAX_ROTATION_ERROR_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,10 +40,12 @@ def make_payloads(scenario: LoadScenario, session: SessionSettings) -> list[Solv
     """Return 64 seeded payloads for the service of *scenario*, encoded by its codec, with their answers."""
     codec = make_codec(scenario.codec, session)
     if scenario.service == "echo":
-        numbers = np.random.default_rng(scenario.seed).integers(0, 1000, (_POOL, max(1, scenario.matches)))
+        numbers = np.random.default_rng(scenario.seed).integers(
+            0, 1000, (_DIFFERENT_PAYLOADS, max(1, scenario.matches))
+        )
         return [SolvedPayload(payload=preencode(codec, {"value": row}), echo=row) for row in numbers.tolist()]
     pool = []
-    for number in range(_POOL):
+    for number in range(_DIFFERENT_PAYLOADS):
         problem = make_problem(
             seed=scenario.seed + number, n=scenario.matches, outlier_ratio=scenario.outliers
         )
@@ -68,4 +70,6 @@ def is_right(problem: SolvedPayload, reply: Any) -> bool:
     truth = problem.T_camera_world
     centres = T[:3, :3].T @ T[:3, 3] - truth[:3, :3].T @ truth[:3, 3]
     cosine = (float(np.vdot(T[:3, :3], truth[:3, :3])) - 1.0) / 2.0
-    return float(centres @ centres) <= _POSE_M**2 and cosine >= math.cos(_POSE_RAD)
+    return float(centres @ centres) <= _MAX_POSITION_ERROR_M**2 and cosine >= math.cos(
+        _MAX_ROTATION_ERROR_RAD
+    )

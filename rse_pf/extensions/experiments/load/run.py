@@ -48,7 +48,7 @@ from rse_pf.terminal import show, show_page
 
 __all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm", "table_of"]
 
-SCENARIO = "scenario.json"
+SCENARIO = "scenario.json"  # name of the file with the description of the load
 FAST_MS = 150.0
 """A command that is answered within this many ms counts as answered in time.
 
@@ -56,9 +56,9 @@ The paper's mean is 156.36 ms.
 """
 
 # Longest wait until all robots have joined, beyond their joining times, in seconds.
-_JOIN_S = 30.0
+_JOIN_TIMEOUT_S = 30.0
 # Time between two lines of progress, in seconds.
-_SHOW_EVERY_S = 1.0
+_PROGRESS_INTERVAL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,7 @@ async def _run(
         screen = asyncio.create_task(_show(swarm, quiet))
         stack.callback(screen.cancel)
         await swarm.start()
-        await swarm.wait_joined(scenario.robots * scenario.join_every_s + _JOIN_S)
+        await swarm.wait_joined(scenario.robots * scenario.join_every_s + _JOIN_TIMEOUT_S)
         await asyncio.sleep(scenario.seconds)
         return await swarm.finish(scenario.deadline_s)
 
@@ -189,7 +189,7 @@ async def _show(swarm: Swarm, quiet: bool) -> None:
     """Print each second, until cancelled: connected robots, answers per second and their round trips."""
     seen, last_s = 0, time.monotonic()
     while not quiet:
-        await asyncio.sleep(_SHOW_EVERY_S)
+        await asyncio.sleep(_PROGRESS_INTERVAL_S)
         fresh, seen = swarm.rows[seen:], len(swarm.rows)
         elapsed_s, last_s = time.monotonic() - last_s, time.monotonic()
         trips = np.concatenate([_round_trips_ms(rows) for rows in fresh] or [np.empty(0)])

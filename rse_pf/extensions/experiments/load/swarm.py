@@ -50,9 +50,9 @@ __all__ = ["Swarm", "SwarmResult", "records_of"]
 # Longest wait until all child processes have encoded their payloads, in seconds.
 _READY_TIMEOUT_S = 60.0
 # Longest wait for the answer of a child process to an order, beyond the time that the order itself takes.
-_END_TIMEOUT_S = 30.0
+_ORDER_TIMEOUT_S = 30.0
 # Time, in seconds, from the order to start to the planned start, so that every child has the order in time.
-_HEAD_START_S = 0.2
+_START_DELAY_S = 0.2
 
 Event = Mapping[str, Any]
 
@@ -157,7 +157,7 @@ class Swarm:
 
     async def start(self) -> None:
         """Order the robots to connect and send: robot k connects ``k * join_every_s`` seconds from now."""
-        self._start_s = time.monotonic() + _HEAD_START_S
+        self._start_s = time.monotonic() + _START_DELAY_S
         if self._origin_s is None:
             self._origin_s = self._start_s
         for child in self._children:
@@ -190,7 +190,7 @@ class Swarm:
         for child in self._children:
             child.pipe.send(RobotsLeave(tuple(sorted(leaving & set(child.numbers)))))
         names = {f"robot-{number + 1}" for number in leaving}
-        await self._until(lambda: names <= self.left, self.scenario.deadline_s + _END_TIMEOUT_S, "leave")
+        await self._until(lambda: names <= self.left, self.scenario.deadline_s + _ORDER_TIMEOUT_S, "leave")
 
     async def finish(self, grace_s: float = 5.0) -> SwarmResult:
         """Stop sending, wait up to *grace_s* seconds for answers, and return the result.
@@ -203,7 +203,9 @@ class Swarm:
         for child in self._children:
             child.pipe.send(FinishSwarm(grace_s))
         await self._until(
-            lambda: all(child.ended is not None for child in self._children), grace_s + _END_TIMEOUT_S, "end"
+            lambda: all(child.ended is not None for child in self._children),
+            grace_s + _ORDER_TIMEOUT_S,
+            "end",
         )
         wall_s = time.monotonic() - self._start_s
         ended = [child.ended for child in self._children if child.ended is not None]
@@ -297,7 +299,7 @@ class Swarm:
         for child in self._children:
             loop.remove_reader(child.pipe.fileno())
         for child in self._children:
-            timeout_s = _HEAD_START_S if child.ended is None else 5.0
+            timeout_s = _START_DELAY_S if child.ended is None else 5.0
             await asyncio.to_thread(end_process, child.process, child.pipe, timeout_s)
         self._children.clear()
         link, self.link = self.link, None

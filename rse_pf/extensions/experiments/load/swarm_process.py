@@ -41,16 +41,16 @@ __all__ = [
 ]  # fmt: skip
 
 # Up, queue, compute and down time (ms) in the row of a command without a result: they are not known.
-_NO_PARTS = (math.nan,) * 4
+_UNKNOWN_PARTS = (math.nan,) * 4
 # Largest number of rows of commands that are sent to the parent in one message.
-_ROWS = 256
+_MAX_ROWS_OF_MESSAGE = 256
 # Longest time, in seconds, that rows of commands wait before they are sent to the parent.
 _FLUSH_EVERY_S = 0.5
 # Pause before a robot whose first connection failed connects again, in seconds.
 _REJOIN_S = 1.0
 # Golden ratio: multiples of it, modulo 1, spread the send times of any number of robots evenly over a frame
 # interval.
-_PHASE = (math.sqrt(5.0) - 1.0) / 2.0
+_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,7 +131,7 @@ def plan_s(scenario: LoadScenario, number: int, start_s: float, frame: int) -> f
 
     Robots have different phases within the frame interval, so that they do not send at the same moment.
     """
-    phase = (number * _PHASE) % 1.0
+    phase = (number * _GOLDEN_RATIO) % 1.0
     return start_s + number * scenario.join_every_s + (frame + phase) / scenario.fps
 
 
@@ -227,7 +227,7 @@ class _Process:
         self.rows.numbers.extend(row)
         self.rows.servers.append(server)
         self.rows.codes.append(code)
-        if len(self.rows) >= _ROWS:
+        if len(self.rows) >= _MAX_ROWS_OF_MESSAGE:
             self._flush()
 
     def _receive(self) -> None:
@@ -373,7 +373,7 @@ class _Robot:
         times = self._waiting.pop(identity, None)
         if times is None:
             return  # the robot has left, and the command counts as lost
-        answer, parts_ms, code = event.answer, _NO_PARTS, "ok"
+        answer, parts_ms, code = event.answer, _UNKNOWN_PARTS, "ok"
         if isinstance(answer, Result):
             up_ms, down_ms = (math.nan if s is None else s * 1e3 for s in (event.up_s, event.down_s))
             parts_ms = (up_ms, answer.queue_ms, answer.compute_ms, down_ms)
@@ -391,7 +391,7 @@ class _Robot:
         server: str,
         code: str,
         wire_bytes: int = 0,
-        parts_ms: tuple[float, ...] = _NO_PARTS,
+        parts_ms: tuple[float, ...] = _UNKNOWN_PARTS,
     ) -> None:
         seconds = (time_s - self._process.origin_s for time_s in times)
         self._process.write((self._number, identity, *seconds, wire_bytes, *parts_ms), server, code)

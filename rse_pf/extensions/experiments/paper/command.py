@@ -33,6 +33,7 @@ __all__ = ["ACTION", "KINDS"]
 
 T = TypeVar("T")
 
+# Experiments of ``rse-pf experiment``, and the verification of their results.
 KINDS = ("latency", "elasticity", "robustness", "map", "live", "verify")
 # Default of ``--robots`` for each experiment.
 _DEFAULT_ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3, "live": 3}

@@ -42,13 +42,13 @@ _NAME = "experiment"
 # Number of servers of the platform.
 _SERVERS = 2
 # Seconds under load before the control plane is killed.
-_LEAD_S = 4.0
+_BEFORE_FAULT_S = 4.0
 # Seconds under load after the new control plane has started.
-_AFTER_S = 6.0
+_AFTER_RESTART_S = 6.0
 # Longest wait until all robots have joined, in seconds.
-_JOIN_S = 60.0
+_JOIN_TIMEOUT_S = 60.0
 # Time between two reads of the state file, in seconds.
-_POLL_S = 0.05
+_STATE_POLL_S = 0.05
 
 
 async def run_control_plane_fault(
@@ -96,12 +96,15 @@ async def run_control_plane_fault(
             )
             async with swarm:
                 await swarm.start()
-                await swarm.wait_joined(_JOIN_S)
-                await asyncio.sleep(_LEAD_S)
+                await swarm.wait_joined(_JOIN_TIMEOUT_S)
+                await asyncio.sleep(_BEFORE_FAULT_S)
                 before = read_state(state_at) or before
                 record("processes", when="before", pids=_pids(before))
                 record(
-                    "fault", fault="kill -9 of the control plane", pid=child.pid, watch_s=down_s + _AFTER_S
+                    "fault",
+                    fault="kill -9 of the control plane",
+                    pid=child.pid,
+                    watch_s=down_s + _AFTER_RESTART_S,
                 )
                 child.send_signal(signal.SIGKILL)
                 child.wait()
@@ -109,7 +112,7 @@ async def run_control_plane_fault(
                 child = _launch(home, settings, folder)
                 after = await _running(state_at, child, before, timeout_s)
                 record("control-plane-back", pid=child.pid)
-                await asyncio.sleep(_AFTER_S)
+                await asyncio.sleep(_AFTER_RESTART_S)
                 after = read_state(state_at) or after
                 record("processes", when="after", pids=_pids(after))
                 result = await swarm.finish()
@@ -156,7 +159,7 @@ async def _running(
         state = read_state(folder)
         if state is not None and state.url and state.control_plane.pid == child.pid:
             return state
-        await asyncio.sleep(_POLL_S)
+        await asyncio.sleep(_STATE_POLL_S)
     when = "start" if before is None else "start again"
     raise CommandFailed(f"rse-pf local did not {when} within {within_s:g} s", hint="see control-plane.log")
 

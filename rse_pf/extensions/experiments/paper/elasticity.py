@@ -61,6 +61,7 @@ _SHORT_BARS: Bars = {
     **dict.fromkeys(("scale_outs", "scale_ins", "crashes"), (1.0, ">=")),
     "replaced_in_s": (5.0, "<="),
 }
+# Name of the file with the image of this experiment.
 FIGURE = "elasticity.png"
 # Seconds between two robots that join, before ``--speed``: that of the paper's Fig. 8.
 _JOIN_EVERY_S = 20.0
@@ -284,7 +285,7 @@ def _phase(harness: Harness, name: str) -> None:
 
 
 # Begin of the scaling policy's reason when it adds servers because some are missing, not because of load.
-_FEWER = "fewer than"
+_MISSING_SERVERS_REASON = "fewer than"
 # Distance below the CPU limit, in percent, at which a mean CPU counts as reaching it: samples are rounded.
 _ROUNDING_PERCENT = 0.01
 
@@ -482,7 +483,7 @@ def _scale_outs(events: Sequence[Event]) -> list[Event]:
     return [
         event
         for event in events
-        if event["action"] == "grow" and not str(event.get("reason", "")).startswith(_FEWER)
+        if event["action"] == "grow" and not str(event.get("reason", "")).startswith(_MISSING_SERVERS_REASON)
     ]
 
 

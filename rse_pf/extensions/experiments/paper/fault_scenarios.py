@@ -22,11 +22,11 @@ __all__ = ["SCENARIOS", "Scenario"]
 # Longest wait for the recovery of the platform, in seconds.
 _TIMEOUT_S = 30.0
 # Seconds for which commands are still recorded after a fault and its recovery.
-_AFTER_S = 6.0
+_RECORDED_AFTER_S = 6.0
 # Pause between two random faults, in seconds.
 _RANDOM_EVERY_S = 3.0
 # Time between two requests for the status of the servers during a link cut, in seconds.
-_POLL_S = 0.1
+_STATUS_POLL_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,26 +48,26 @@ class Scenario:
 
 async def _kill(harness: Harness, seconds: float, seed: int) -> None:
     began = harness.now()
-    harness.kill(_AFTER_S)
+    harness.kill(_RECORDED_AFTER_S)
     await _wait_replaced(harness, began)
-    await harness.run_for(_AFTER_S)
+    await harness.run_for(_RECORDED_AFTER_S)
 
 
 async def _stop(harness: Harness, seconds: float, seed: int) -> None:
     began = harness.now()
     _pause_busiest(harness, 10.0)
     await _wait_replaced(harness, began)
-    await harness.run_for(_AFTER_S)
+    await harness.run_for(_RECORDED_AFTER_S)
 
 
 async def _balancer(harness: Harness, seconds: float, seed: int) -> None:
     await _kill_balancer(harness, 8.0)
-    await harness.run_for(_AFTER_S)
+    await harness.run_for(_RECORDED_AFTER_S)
 
 
 async def _scale_in(harness: Harness, seconds: float, seed: int) -> None:
     await _drain_busiest(harness, 10.0)
-    await harness.run_for(_AFTER_S)
+    await harness.run_for(_RECORDED_AFTER_S)
 
 
 async def _roll(harness: Harness, seconds: float, seed: int) -> None:
@@ -75,7 +75,7 @@ async def _roll(harness: Harness, seconds: float, seed: int) -> None:
     harness.log("fault", fault="rolling replacement", watch_s=60.0)
     await harness.platform.roll()
     harness.log("rolled", seconds=round(harness.now() - began, 3))
-    await harness.run_for(_AFTER_S)
+    await harness.run_for(_RECORDED_AFTER_S)
 
 
 async def _scale_out(harness: Harness, seconds: float, seed: int) -> None:
@@ -98,7 +98,7 @@ async def _wifi(harness: Harness, seconds: float, seed: int) -> None:
         await asyncio.gather(polling, return_exceptions=True)
     await link.heal()
     harness.log("healed")
-    await harness.run_for(_AFTER_S)
+    await harness.run_for(_RECORDED_AFTER_S)
 
 
 async def _log_when_empty(harness: Harness) -> None:
@@ -108,7 +108,7 @@ async def _log_when_empty(harness: Harness) -> None:
         if len(servers) == len(harness.platform.servers) and not any(server["robots"] for server in servers):
             harness.log("servers-empty")
             return
-        await asyncio.sleep(_POLL_S)
+        await asyncio.sleep(_STATUS_POLL_S)
 
 
 async def _random(harness: Harness, seconds: float, seed: int) -> None:
@@ -129,13 +129,13 @@ async def _random(harness: Harness, seconds: float, seed: int) -> None:
 
 async def _random_fault(harness: Harness, kind: str) -> None:
     if kind == "kill":
-        harness.kill(_AFTER_S)
+        harness.kill(_RECORDED_AFTER_S)
     elif kind == "stop":
-        _pause_busiest(harness, _AFTER_S)
+        _pause_busiest(harness, _RECORDED_AFTER_S)
     elif kind == "balancer":
-        await _kill_balancer(harness, _AFTER_S)
+        await _kill_balancer(harness, _RECORDED_AFTER_S)
     else:
-        await _drain_busiest(harness, _AFTER_S, grow_first=True)
+        await _drain_busiest(harness, _RECORDED_AFTER_S, grow_first=True)
 
 
 def _pause_busiest(harness: Harness, watch_s: float) -> None:

@@ -40,6 +40,7 @@ from rse_pf.terminal import show, show_page
 
 __all__ = ["LatencyOptions", "latency_figures", "latency_page", "run_latency"]
 
+# Name of the file with the image of this experiment.
 FIGURE = "latency.png"
 # Arguments of the short run with which ``verify --rerun`` checks this experiment.
 _SHORT = ("--robots", "20", "--seconds", "5")

@@ -28,6 +28,7 @@ from rse_pf.terminal import show_page
 
 __all__ = ["FIGURE", "live_experiment_figures", "live_page", "run_live"]
 
+# Name of the file with the image of this experiment.
 FIGURE = "live.png"
 
 

@@ -56,6 +56,7 @@ __all__ = [
     "time_until_even_s",
 ]
 
+# Name of the file with the image of this experiment.
 FIGURE = "robustness.png"
 # Seconds under load before the fault.
 _BEFORE_FAULT_S = 4.0
@@ -211,9 +212,9 @@ BARS: dict[str, dict[str, tuple[float, str]]] = {
 """The targets of each scenario: limit and comparison that must hold, by the path of the figure."""
 
 # Largest deviation of a server's robots from the mean of all servers that counts as even, as a ratio.
-_EVEN = 0.2
+_MAX_EVEN_DEVIATION = 0.2
 # Time between the decision of the SDK to deliver an answer and the time stamp in the record, in seconds.
-_CLOCK_S = 0.05
+_DELIVERY_DELAY_S = 0.05
 
 
 def robustness_figures(records: Records) -> dict[str, Any]:
@@ -291,7 +292,7 @@ def time_until_even_s(samples: Sequence[MonitorSample], since_s: float) -> float
             continue  # no robot is connected any more
         mean = sum(counts) / len(counts)
         # A server has a whole number of robots: a deviation of one is always accepted.
-        even = all(abs(count - mean) <= max(_EVEN * mean, 1.0) for count in counts)
+        even = all(abs(count - mean) <= max(_MAX_EVEN_DEVIATION * mean, 1.0) for count in counts)
         if not even:
             reached = None
         elif reached is None:
@@ -388,7 +389,7 @@ def _measure_cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
         if event["action"] == "link-lost" and faults and event["time"] >= faults[0]["time"]:
             noticed.setdefault(str(event["robot"]), float(event["time"]) - float(faults[0]["time"]))
     first = _first_answers(records.commands, healed[0]) if healed else []
-    deadline_s = float(parameters_of(records)["deadline_s"]) + _CLOCK_S
+    deadline_s = float(parameters_of(records)["deadline_s"]) + _DELIVERY_DELAY_S
     stale = sum(
         command.code == "ok" and command.answered is not None and command.answered - command.sent > deadline_s
         for command in records.commands

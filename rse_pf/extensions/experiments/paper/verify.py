@@ -33,13 +33,14 @@ __all__ = [
 ]
 
 # Largest difference between a round trip and its time stamps that rounding explains, in ms.
-_CLOCK_MS = 0.01
+_MAX_ROUNDING_MS = 0.01
 # The figure that needs the point clouds, which shipped results may lack.
 _CLOUD_FIGURE = "map_points"
 # Largest number of characters of a value in the output; longer values are cut.
-_MAX_SHOWN = 60
+_MAX_SHOWN_CHARACTERS = 60
 # Experiments whose round trips count from the real send time: their robots plan frames, not commands.
 _FRAME_EXPERIMENTS = {"map", "live", "live-fault"}
+# Hint of errors about a folder that holds no results.
 _HINT = "name the --out of an experiment"
 
 # The function that computes the figures of a run, by the kind of its experiment.
@@ -175,7 +176,7 @@ def _wrong_round_trip(records: Records) -> str:
         trip_ms = 1000.0 * (command.answered - (command.sent if mapping else command.planned))
         over_ms = trip_ms - command.round_trip_ms
         # A mapping robot does other work between the end of the round trip and the time stamp of the answer.
-        wrong = over_ms < -_CLOCK_MS if mapping else abs(over_ms) > _CLOCK_MS
+        wrong = over_ms < -_MAX_ROUNDING_MS if mapping else abs(over_ms) > _MAX_ROUNDING_MS
         if command.answered < command.sent or wrong:
             return (
                 f"command {command.id} of {command.robot}: planned {command.planned}, sent {command.sent}, "
@@ -218,9 +219,9 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 def _short(value: Any) -> str:
     text = json.dumps(value)
-    if isinstance(value, list) and len(text) > _MAX_SHOWN:
+    if isinstance(value, list) and len(text) > _MAX_SHOWN_CHARACTERS:
         return f"{len(value)} entries"
-    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+    return text if len(text) <= _MAX_SHOWN_CHARACTERS else text[: _MAX_SHOWN_CHARACTERS - 3] + "..."
 
 
 def _if(broken: Any, text: str) -> str:

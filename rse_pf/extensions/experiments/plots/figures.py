@@ -26,6 +26,7 @@ from rse_pf.maps.format import MapVersion
 
 __all__ = ["draw_elasticity", "draw_latency", "draw_live", "draw_robustness", "require_matplotlib"]
 
+# Colours of the curves and bars.
 _BLUE = "#1f5fa8"
 _ORANGE = "#d9822b"
 _GREEN = "#3a8f4d"
@@ -37,10 +38,10 @@ _PARTS_NAMES = {"up_ms": "up", "queue_ms": "queue", "compute_ms": "compute", "do
 # Legend of the paper's transmission time, which the paper does not divide into up and down.
 _TRANSMISSION = "transmission, not split"
 # Number of bins of equal width along the time axis over which round trips and failures are aggregated.
-_BINS = 80
+_TIME_BINS = 80
 # Upper limit of the CPU axis: a server with emulated cores limits the requests that it starts, not the CPU
 # time that they use, so that peaks exceed 100 %.
-_MAX_PERCENT = 170.0
+_MAX_CPU_PERCENT = 170.0
 _DPI = 130  # resolution of the PNG files, in dots per inch
 
 
@@ -201,7 +202,7 @@ def _servers(axis: Any, records: Records, parameters: Mapping[str, Any]) -> None
     axis.plot(times, means, color=_BLUE, label="mean CPU", linewidth=1.6)
     limit = float(parameters["busy_cpu_percent"])
     axis.axhline(limit, color=_RED, linestyle="--", linewidth=1, label=f"{limit:g} %, as in the paper")
-    axis.set_ylim(0, min(max(125.0, max(cpu, default=0.0) * 1.2), _MAX_PERCENT))
+    axis.set_ylim(0, min(max(125.0, max(cpu, default=0.0) * 1.2), _MAX_CPU_PERCENT))
     axis.set_ylabel("mean CPU utilization, %", color=_BLUE)
     count = axis.twinx()
     count.step(
@@ -294,16 +295,16 @@ def _server_number(name: str) -> tuple[int, str]:
 def _bin_commands(
     commands: Sequence[CommandRecord], among: Sequence[CommandRecord]
 ) -> tuple[Any, list[list[CommandRecord]]]:
-    """Return the edges of `_BINS` bins of equal width, and for each bin the *commands* planned within it.
+    """Return the edges of `_TIME_BINS` bins of equal width, and for each bin the *commands* planned in it.
 
     The bins span the planned send times of *among*, which includes commands that *commands* does not.
     """
     planned = [record.planned for record in among] or [0.0, 1.0]
-    edges = np.linspace(min(planned), max(planned) + 1e-6, _BINS + 1)
-    bins: list[list[CommandRecord]] = [[] for _ in range(_BINS)]
+    edges = np.linspace(min(planned), max(planned) + 1e-6, _TIME_BINS + 1)
+    bins: list[list[CommandRecord]] = [[] for _ in range(_TIME_BINS)]
     for command in commands:
         place = int(np.searchsorted(edges, command.planned, side="right")) - 1
-        bins[min(max(place, 0), _BINS - 1)].append(command)
+        bins[min(max(place, 0), _TIME_BINS - 1)].append(command)
     return edges, bins
 
 

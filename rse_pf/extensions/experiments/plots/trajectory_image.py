@@ -28,19 +28,19 @@ from rse_pf.terminal import printable
 
 __all__ = ["DrawnPath", "Panel", "draw_trajectories", "pieces"]
 
-_WIDTH = 800  # width of a panel, in pixels
-_HEIGHT = 640  # height of a panel, in pixels
-_TITLE = 48  # height of a panel's title, in pixels
-_LEGEND = 92  # height of a panel's legend, in pixels
-_MARGIN = 28  # pixels between the border of a panel and its content
-_ACROSS = 2  # number of panels in a row of the image
-_PAPER = (255, 255, 255)  # colour (RGB) of the background
-_TRUTH = (150, 156, 166)  # colour (RGB) of the true path
-_FRAME = (228, 231, 236)  # colour (RGB) of the border of a panel
+_PANEL_WIDTH_PX = 800  # width of a panel, in pixels
+_PANEL_HEIGHT_PX = 640  # height of a panel, in pixels
+_TITLE_HEIGHT_PX = 48  # height of a panel's title, in pixels
+_LEGEND_HEIGHT_PX = 92  # height of a panel's legend, in pixels
+_MARGIN_PX = 28  # pixels between the border of a panel and its content
+_PANELS_PER_ROW = 2  # number of panels in a row of the image
+_BACKGROUND_COLOUR = (255, 255, 255)  # colour (RGB) of the background
+_TRUTH_COLOUR = (150, 156, 166)  # colour (RGB) of the true path
+_BORDER_COLOUR = (228, 231, 236)  # colour (RGB) of the border of a panel
 # A path is not drawn across a gap of more than this many times the median interval between poses.
-_BREAK = 2.5
+_MAX_GAP_RATIO = 2.5
 # Largest number of panels in an image.
-_MOST_PANELS = 24
+_MAX_PANELS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,14 +71,16 @@ def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
         MissingExtra: Pillow is not installed.
     """
     image_module, draw_module, font_module = pillow()
-    panels = panels[:_MOST_PANELS]
-    across = min(_ACROSS, max(1, len(panels)))
+    panels = panels[:_MAX_PANELS]
+    across = min(_PANELS_PER_ROW, max(1, len(panels)))
     down = max(1, math.ceil(len(panels) / across))
-    image = image_module.new("RGB", (across * _WIDTH, down * _HEIGHT), _PAPER)
+    image = image_module.new("RGB", (across * _PANEL_WIDTH_PX, down * _PANEL_HEIGHT_PX), _BACKGROUND_COLOUR)
     draw = draw_module.Draw(image)
     fonts = font_module.load_default(size=22), font_module.load_default(size=16)
     for number, panel in enumerate(panels):
-        _draw_panel(draw, panel, (number % across * _WIDTH, number // across * _HEIGHT), fonts)
+        _draw_panel(
+            draw, panel, (number % across * _PANEL_WIDTH_PX, number // across * _PANEL_HEIGHT_PX), fonts
+        )
     image.save(path, format="PNG")
 
 
@@ -91,28 +93,35 @@ def pieces(trajectory: Trajectory) -> list[Array]:
         return []
     apart_s = np.diff(trajectory.timestamps_s)
     usual_s = float(np.median(apart_s)) if len(apart_s) else 0.0
-    return np.split(trajectory.positions, np.flatnonzero(apart_s > _BREAK * usual_s) + 1)
+    return np.split(trajectory.positions, np.flatnonzero(apart_s > _MAX_GAP_RATIO * usual_s) + 1)
 
 
 def _draw_panel(draw: Any, panel: Panel, corner: tuple[int, int], fonts: tuple[Any, Any]) -> None:
     left, top = corner
     big, small = fonts
-    draw.rectangle([left, top, left + _WIDTH - 1, top + _HEIGHT - 1], outline=_FRAME, width=2)
-    title = fitting(draw, printable(panel.title), big, _WIDTH - 2 * _MARGIN)
-    draw.text((left + _MARGIN, top + 12), title, fill=INK, font=big)
+    draw.rectangle(
+        [left, top, left + _PANEL_WIDTH_PX - 1, top + _PANEL_HEIGHT_PX - 1], outline=_BORDER_COLOUR, width=2
+    )
+    title = fitting(draw, printable(panel.title), big, _PANEL_WIDTH_PX - 2 * _MARGIN_PX)
+    draw.text((left + _MARGIN_PX, top + 12), title, fill=INK, font=big)
     shown = [
         each.positions for each in (panel.truth, *(drawn.path for drawn in panel.paths)) if each is not None
     ]
     points = np.concatenate([*shown, np.empty((0, 3))])
     if not len(points):
-        draw.text((left + _MARGIN, top + _TITLE + 20), "no poses", fill=INK, font=small)
+        draw.text((left + _MARGIN_PX, top + _TITLE_HEIGHT_PX + 20), "no poses", fill=INK, font=small)
         return
     basis = _basis(points if panel.truth is None else panel.truth.positions)
     flat = points @ basis
     low, high = flat.min(axis=0), flat.max(axis=0)
-    room = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - _TITLE - _LEGEND - _MARGIN])
+    room = np.array(
+        [
+            _PANEL_WIDTH_PX - 2 * _MARGIN_PX,
+            _PANEL_HEIGHT_PX - _TITLE_HEIGHT_PX - _LEGEND_HEIGHT_PX - _MARGIN_PX,
+        ]
+    )
     scale = float((room / np.maximum(high - low, 1e-6)).min())
-    middle = np.array([left + _WIDTH / 2, top + _TITLE + (room[1] + _MARGIN) / 2])
+    middle = np.array([left + _PANEL_WIDTH_PX / 2, top + _TITLE_HEIGHT_PX + (room[1] + _MARGIN_PX) / 2])
 
     def line(trajectory: Trajectory, colour: tuple[int, int, int], width: int) -> None:
         for piece in pieces(trajectory):
@@ -124,15 +133,22 @@ def _draw_panel(draw: Any, panel: Panel, corner: tuple[int, int], fonts: tuple[A
             else:
                 draw.line(places, fill=colour, width=width, joint="curve")
 
-    legend = [] if panel.truth is None else [("truth", _TRUTH)]
+    legend = [] if panel.truth is None else [("truth", _TRUTH_COLOUR)]
     if panel.truth is not None:
-        line(panel.truth, _TRUTH, 7)
+        line(panel.truth, _TRUTH_COLOUR, 7)
     for number, drawn in enumerate(panel.paths):
         line(drawn.path, COLOURS[number % len(COLOURS)], 3)
         legend.append((printable(drawn.name), COLOURS[number % len(COLOURS)]))
-    right = left + _WIDTH - _MARGIN
-    draw_scale(draw, scale, (right, top + _HEIGHT - _LEGEND - 6), panel.unit, small)
-    draw_legend(draw, legend, (left + _MARGIN, top + _HEIGHT - _LEGEND + 14), right, small, lines=3)
+    right = left + _PANEL_WIDTH_PX - _MARGIN_PX
+    draw_scale(draw, scale, (right, top + _PANEL_HEIGHT_PX - _LEGEND_HEIGHT_PX - 6), panel.unit, small)
+    draw_legend(
+        draw,
+        legend,
+        (left + _MARGIN_PX, top + _PANEL_HEIGHT_PX - _LEGEND_HEIGHT_PX + 14),
+        right,
+        small,
+        lines=3,
+    )
 
 
 def _basis(positions: Array) -> Array:

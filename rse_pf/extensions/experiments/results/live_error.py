@@ -47,7 +47,7 @@ LIVE_MAP = "live.rsemap"
 # Scale in the records of a robot that measures lengths in an unknown unit.
 _UP_TO_SCALE = "up to scale"
 # Printed if no robot has a metric scale.
-_NO_METRES = (
+_NO_METRIC_SCALE = (
     "no robot has metres, so that no robot could be aligned with the map: each has one camera without depth\n"
     "  hint: let one of them have depth, a stereo pair or an IMU: --camera stereo, --imu\n"
 )
@@ -224,7 +224,7 @@ def live_lines(live: Mapping[str, Any], robots: int) -> str:
         f"{live['joined']} of {robots} in one live map of {live['keyframes']} keyframes, "
         f"{live.get('points') or 0:,} points; {errors}"
         f"{live['aligned_percent']} % of the poses aligned; {times if delay['n'] else 'no correction'}\n"
-        + (_NO_METRES if live.get("without_metres") == robots else "")
+        + (_NO_METRIC_SCALE if live.get("without_metres") == robots else "")
     )
 
 

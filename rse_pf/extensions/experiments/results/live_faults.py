@@ -33,7 +33,7 @@ from rse_pf.extensions.experiments.results.summary import summarise
 __all__ = ["LIVE_FAULT_BARS", "fault_rows", "live_fault_figures"]
 
 # Names of the faults after which another server must serve the map.
-_NEW_OWNER = {"kill", "stop", "drain", "roll"}
+_FAULTS_WITH_NEW_SERVER = {"kill", "stop", "drain", "roll"}
 # Targets of every fault: nothing that was acknowledged is lost, and the replayed log gives the same map.
 _NO_LOSS = {
     "keyframes/lost": (0.0, "<="),
@@ -46,7 +46,10 @@ _NO_LOSS = {
 }
 LIVE_FAULT_BARS: dict[str, dict[str, tuple[float, str]]] = {
     "none": _NO_LOSS,
-    **{name: {**_NO_LOSS, "new_owner_s": (3.0, "<="), "owners": (2.0, ">=")} for name in sorted(_NEW_OWNER)},
+    **{
+        name: {**_NO_LOSS, "new_owner_s": (3.0, "<="), "owners": (2.0, ">=")}
+        for name in sorted(_FAULTS_WITH_NEW_SERVER)
+    },
     "store": _NO_LOSS,
     "wifi": {**_NO_LOSS, "keyframes/ahead_of_poses": (0.0, "<=")},
 }
@@ -103,7 +106,7 @@ def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
         for one_run in runs.values()
         if one_run["fault"] == "none" and one_run["live"]["final_ate_cm"] is not None
     ]
-    rows = [list(_HEAD)]
+    rows = [list(_TABLE_HEAD)]
     for name, run in runs.items():
         tally, live, ate = run["keyframes"], run["live"], run["live"]["final_ate_cm"]
         than = (
@@ -131,7 +134,7 @@ def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
 
 
 # The head of the table of `fault_rows`.
-_HEAD = (
+_TABLE_HEAD = (
     "fault", "at s", "keyframes acknowledged / in the log", "lost / twice / out of order / ahead of poses",
     "frames lost", "new owner after s (owners)", "longest acknowledgement s", "replay equal",
     "ATE cm (against undisturbed)", "joined, aligned %", "correction ms p50 / p99", "pose ms p50 / p99",

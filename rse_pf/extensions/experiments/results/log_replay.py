@@ -30,7 +30,7 @@ __all__ = ["LoggedMap", "read_log", "run"]
 # Name of the demo's live map.
 _MAP_NAME = "demo"
 # Time after which a child process that has answered and does not exit is killed, in seconds.
-_END_S = 5.0
+_EXIT_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,7 @@ def read_log(objects: Path, position: int) -> LoggedMap:
     child = start_child(ChildPlan(target=f"{__name__}:run", name="rse-pf replay"))
     child.say([str(objects), position])
     answer = receive(child.connection)
-    code = child.end(_END_S)
+    code = child.end(_EXIT_TIMEOUT_S)
     if isinstance(answer, dict):
         return msgspec.convert(answer, LoggedMap)
     raise UsageError(f"cannot replay the log in {objects}: {answer or how_ended(code)}", hint="run it again")

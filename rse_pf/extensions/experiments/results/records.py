@@ -51,6 +51,7 @@ TRUTH = "truth.txt"
 """Name of the file with a robot's true trajectory, in the folder of the robot."""
 # Exceptions that a missing or malformed file of records raises.
 _MALFORMED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+# Hint of errors about missing or malformed records.
 _HINT = "name the folder of a run"
 
 Event = Mapping[str, Any]
@@ -92,7 +93,9 @@ class Records:
     folder: Path = Path()
 
 
+# Columns of ``commands.csv``.
 _COMMAND_COLUMNS = [field.name for field in fields(CommandRecord)]
+# Columns of ``samples.csv`` that describe a server.
 _SERVER_COLUMNS = ["server", *(field.name for field in fields(ServerSample) if field.name != "name")]
 
 

@@ -34,7 +34,7 @@ RUN_FILES = ("report.json", "report.md", COMMANDS, EVENTS, SAMPLES, "platform")
 """Names of the files and the folder that every experiment and the demo write."""
 _CHECKOUT = Path(__file__).resolve().parents[4]
 # Time limit of ``git describe``, in seconds.
-_GIT_S = 10.0
+_GIT_TIMEOUT_S = 10.0
 # Packages whose versions the report states.
 _PACKAGES = (
     "rse-pf",
@@ -128,7 +128,11 @@ def commit_of(checkout: Path) -> str:
     command = ["git", "-C", str(checkout), "describe", "--always", "--exclude=*", "--abbrev=40"]
     try:
         asked = subprocess.run(
-            [*command, "--dirty=+changes"], capture_output=True, text=True, timeout=_GIT_S, check=False
+            [*command, "--dirty=+changes"],
+            capture_output=True,
+            text=True,
+            timeout=_GIT_TIMEOUT_S,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
         return ""

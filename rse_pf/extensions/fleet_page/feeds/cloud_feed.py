@@ -37,7 +37,7 @@ _MAX_TEXT = 300
 # Number of the newest periods that may lack a CPU value, because CloudWatch publishes it late.
 _LATE_PERIODS = 2
 # Exceptions that the parsing of an unexpected answer of AWS raises.
-_NOT_UNDERSTOOD = (LookupError, TypeError, ValueError)
+_MALFORMED_ANSWER_ERRORS = (LookupError, TypeError, ValueError)
 # Sentences about data that AWS does not provide, for the page.
 _UNAVAILABLE = (
     "Commands, queue and wait are published for the whole group, not for each server",
@@ -133,7 +133,7 @@ class CloudFeed:
         except RsePfError as error:
             self._problems[subject] = f"{error.message} ({error.hint})"
             return None
-        except _NOT_UNDERSTOOD as error:  # the page shows the data of the other answers
+        except _MALFORMED_ANSWER_ERRORS as error:  # the page shows the data of the other answers
             self._problems[subject] = f"AWS answers in a way that is not understood: {error}"
             return None
         self._problems.pop(subject, None)
@@ -197,7 +197,9 @@ def cloud_document(
         "cloud": True,
         "platform": printable(f"on AWS, {region}"),
         "url": printable("" if balancer is None else balancer.address),
-        "tls": balancer is not None and bool(balancer.protocols) and set(balancer.protocols) <= _SECURE,
+        "tls": balancer is not None
+        and bool(balancer.protocols)
+        and set(balancer.protocols) <= _ENCRYPTING_PROTOCOLS,
         "protocols": [] if balancer is None else [printable(protocol) for protocol in balancer.protocols],
         "balancer": balancer is not None and balancer.state in ("active", "active_impaired"),
         "balancer_state": printable("not known" if balancer is None else balancer.state),
@@ -244,7 +246,7 @@ def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: fl
             events.append(
                 _event(
                     time_s, f"alarm-{name}", f"alarm {name} is in state {state}: {reason}",
-                    group="trouble" if state == "ALARM" and name not in _SCALES else "scaling",
+                    group="trouble" if state == "ALARM" and name not in _SCALING_ALARMS else "scaling",
                 )
             )  # fmt: skip
     if before is not None:
@@ -253,9 +255,9 @@ def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: fl
 
 
 # Protocols of listeners that encrypt.
-_SECURE = {"TLS", "HTTPS"}
-# Alarms that add or remove servers; all others are about trouble.
-_SCALES = ("busy", "idle", "crowded", "underused")
+_ENCRYPTING_PROTOCOLS = {"TLS", "HTTPS"}
+# Names of the alarms that add or remove servers; all other alarms report problems.
+_SCALING_ALARMS = ("busy", "idle", "crowded", "underused")
 
 
 def _changes(before: AutoScalingGroup, after: AutoScalingGroup, time_s: float) -> list[dict[str, Any]]:

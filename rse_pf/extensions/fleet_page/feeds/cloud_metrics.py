@@ -24,6 +24,7 @@ PERIODS = 60
 _FRESH_PERIODS = 3
 # Largest number of servers whose metrics are requested, two for each: GetMetricData accepts 500 queries.
 _MAX_SERVERS = 200
+# Namespace of the metrics of EC2 in CloudWatch.
 _EC2 = "AWS/EC2"
 # Metrics of the group by our name: namespace, name and statistic in CloudWatch.
 _GROUP_SERIES = {

@@ -15,9 +15,9 @@ from rse_pf.terminal import printable
 __all__ = ["CommandLog"]
 
 # Lines without these bytes are about other events, and are not parsed.
-_MARK = b'"command"'
+_COMMAND_MARK = b'"command"'
 # Members of a line that are shown.
-_FIELDS = (
+_SHOWN_FIELDS = (
     "robot", "service", "id", "trace", "code", "verdict", "reason", "queue_ms", "compute_ms", "bytes_in",
     "server",
 )  # fmt: skip
@@ -57,7 +57,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
     None if the line is not about a weak or failed command.  Commands with the codes busy and stale are no
     failures here.
     """
-    if _MARK not in line:
+    if _COMMAND_MARK not in line:
         return None
     try:
         fields = json.loads(line)
@@ -65,7 +65,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(fields, dict) or fields.get("event") != "command":
         return None
-    row: dict[str, Any] = {name: fields[name] for name in _FIELDS if name in fields}
+    row: dict[str, Any] = {name: fields[name] for name in _SHOWN_FIELDS if name in fields}
     if row.get("code") in ("busy", "stale") or (row.get("code") == "ok" and row.get("verdict") != "weak"):
         return None
     time_s = fields.get("time", 0.0)

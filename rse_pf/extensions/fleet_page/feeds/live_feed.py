@@ -24,13 +24,14 @@ from rse_pf.terminal import printable
 
 __all__ = ["LIVE", "SCOPES", "LiveFeed", "histories", "plain"]
 
+# Beginning of the topics of live maps; the name of the map follows.
 LIVE = "live/"
 # Name of the robot in the feed's token.
 _ROBOT = "fleet-page"
 SCOPES = ("maps:live", SYNTHETIC)
 """Scopes of the feed's token; the second one lets servers not count the connection as a robot."""
 # Validity of the feed's token, in seconds.
-_TTL_S = 600.0
+_TOKEN_LIFETIME_S = 600.0
 # Time between two checks which maps the open pages show, in seconds.
 _CHECK_PAGES_S = 0.5
 # Time between two readings of the list of live maps, in seconds.
@@ -161,5 +162,5 @@ def _token(state: PlatformState, settings: PlatformSettings, tenant: str) -> str
     key = read_key(Path(state.key_file))
     return key.issue(
         _ROBOT, now=time.time(), token_id=secrets.token_hex(8), settings=settings.auth,
-        ttl_s=min(_TTL_S, settings.auth.token_ttl_s), scopes=SCOPES, tenant=tenant,
+        ttl_s=min(_TOKEN_LIFETIME_S, settings.auth.token_ttl_s), scopes=SCOPES, tenant=tenant,
     )  # fmt: skip

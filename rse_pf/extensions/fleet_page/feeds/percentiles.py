@@ -15,8 +15,10 @@ from typing import Any
 
 __all__ = ["LastMinute", "buckets_of", "percentile"]
 
-_MINUTE_S = 60.0  # time over which percentiles are computed, in seconds
+_COVERED_TIME_S = 60.0  # time over which percentiles are computed, in seconds
+# A line of Prometheus metrics with a bucket of the histogram of durations.
 _BUCKET = re.compile(r"rse_pf_duration_seconds_bucket\{([^}]*)\} ([0-9.eE+]+)")
+# The upper bound of a bucket in its labels.
 _BOUND = re.compile(r'le="([^"]+)"')
 
 Buckets = dict[float, float]
@@ -82,7 +84,7 @@ class LastMinute:
         summed: Buckets = {}
         covered_s = 0.0
         for snapshots in self._taken.values():
-            while len(snapshots) > 1 and snapshots[1][0] <= now_s - _MINUTE_S:
+            while len(snapshots) > 1 and snapshots[1][0] <= now_s - _COVERED_TIME_S:
                 snapshots.popleft()
             (began_s, first), (ended_s, last) = snapshots[0], snapshots[-1]
             covered_s = max(covered_s, ended_s - began_s)
@@ -96,5 +98,5 @@ class LastMinute:
 
         return {
             "p50_ms": percentile_ms(0.5), "p95_ms": percentile_ms(0.95), "p99_ms": percentile_ms(0.99),
-            "count": int(count), "covered_s": round(min(covered_s, _MINUTE_S), 1),
+            "count": int(count), "covered_s": round(min(covered_s, _COVERED_TIME_S), 1),
         }  # fmt: skip

@@ -53,16 +53,16 @@ _RETRY_S = 0.5
 # Time limit of a request to a server, in seconds.
 _REQUEST_TIMEOUT_S = 2.0
 # Number of samples in the charts: the last ten minutes.
-_HISTORY = 600
+_CHART_SAMPLES = 600
 # Largest number of characters of a text.
 _MAX_TEXT = 300
 # Largest number of events about moved robots after one reading.
 _MAX_MOVE_EVENTS = 50
 # Largest number of robots without a connection to a server for which the last server is still stored.
-_MAX_GONE = 500
+_MAX_ABSENT_ROBOTS = 500
 # Exceptions of an unexpected answer, such as that of a server of another version or of one that is being
 # killed.
-_UNREADABLE = (RsePfError, OSError, ValueError, KeyError, TypeError)
+_UNEXPECTED_ANSWER_ERRORS = (RsePfError, OSError, ValueError, KeyError, TypeError)
 
 
 class LocalFeed:
@@ -80,7 +80,7 @@ class LocalFeed:
         self._minute = LastMinute()
         self._percentiles: dict[str, Any] = {}
         self._where: dict[str, str] = {}
-        self._history: deque[list[float | None]] = deque(maxlen=_HISTORY)
+        self._history: deque[list[float | None]] = deque(maxlen=_CHART_SAMPLES)
         self._connected = False
         self._sampled_s: float | None = -1.0
 
@@ -160,7 +160,7 @@ class LocalFeed:
     async def _follow_robots(self) -> None:
         while True:
             if self._hub.watches("robots"):
-                with contextlib.suppress(*_UNREADABLE):
+                with contextlib.suppress(*_UNEXPECTED_ANSWER_ERRORS):
                     await self._read_robots()
             await asyncio.sleep(_ROBOTS_EVERY_S)
 
@@ -178,7 +178,7 @@ class LocalFeed:
             self._event({"event": "robot-moved", "robot": robot, "before": before, "server": after})
         # A robot that moves is on no server for a moment, so that the last servers of absent robots are
         # stored.
-        gone = [item for item in self._where.items() if item[0] not in where][-_MAX_GONE:]
+        gone = [item for item in self._where.items() if item[0] not in where][-_MAX_ABSENT_ROBOTS:]
         self._where = {**dict(gone), **where}
         self._hub.put("robots", "now", rows)
 
@@ -188,7 +188,7 @@ class LocalFeed:
         A page that is opened later thus has the percentiles of the last minute at once.
         """
         while True:
-            with contextlib.suppress(*_UNREADABLE):
+            with contextlib.suppress(*_UNEXPECTED_ANSWER_ERRORS):
                 await self._read_metrics()
             is_first = not self._percentiles.get("covered_s")
             await asyncio.sleep(_FIRST_METRICS_S if is_first else _METRICS_EVERY_S)

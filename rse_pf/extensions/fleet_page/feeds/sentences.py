@@ -16,6 +16,7 @@ from rse_pf.scaling.rules import BIG_STEP, STEP
 
 __all__ = ["waiting_for"]
 
+# Words for the numbers 0 to 10.
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 

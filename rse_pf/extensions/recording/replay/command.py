@@ -34,9 +34,10 @@ if TYPE_CHECKING:
 
 __all__ = ["ACTION"]
 
-_SHOWN = 20  # largest number of troubles, and of changed answers, that are printed
-_IN_PAGE = 5  # number of the worst commands whose reports are in the HTML file
-_LISTED_IN_JSON = 500  # largest number of troubles in JSON
+_MAX_PRINTED = 20  # largest number of troubles, and of changed answers, that are printed
+_REPORTS_IN_PAGE = 5  # number of the worst commands whose reports are in the HTML file
+_MAX_TROUBLES_IN_JSON = 500  # largest number of troubles in JSON
+# Names of the PnP engines that ``--engine`` accepts.
 _ENGINES = ("native", "opencv")
 # Pattern of the id of a command: ``CONNECTION:ID`` or ``ID``.
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
@@ -122,12 +123,16 @@ def _show_all(request: ReplayRequest, replay: LimitedReplay, overrides: Override
     solve = bool(request.all or request.json or overrides.changes)
     with at_work("reading the recording"):
         overview = replay.overview(
-            request.file, solve=solve, overrides=overrides, worst=_LISTED_IN_JSON if request.json else _SHOWN
+            request.file,
+            solve=solve,
+            overrides=overrides,
+            worst=_MAX_TROUBLES_IN_JSON if request.json else _MAX_PRINTED,
         )
         reports = []
         if request.html is not None:
             reports = [
-                replay.command(request.file, each.id, overrides) for each in overview.troubles[:_IN_PAGE]
+                replay.command(request.file, each.id, overrides)
+                for each in overview.troubles[:_REPORTS_IN_PAGE]
             ]
     if request.html is not None:
         _write_page(request.html, reports, overview, request.file.name)
@@ -153,10 +158,10 @@ def _show_overview(overview: Overview, request: ReplayRequest) -> None:
         show(f"solved again: {overview.equal} equal to the byte, {overview.different} different")
         for why, count in overview.not_solved.items():
             show(f"not solved again: {count}: {why}")
-        for each in overview.changed[:_SHOWN]:
+        for each in overview.changed[:_MAX_PRINTED]:
             show(f"  {each.id}  {each.what}")
-        if len(overview.changed) > _SHOWN:
-            show(f"  and {overview.different - _SHOWN} more; --json lists them")
+        if len(overview.changed) > _MAX_PRINTED:
+            show(f"  and {overview.different - _MAX_PRINTED} more; --json lists them")
     bad = sum(overview.by_kind.values())
     if not bad:
         show("no command went wrong; whether calibration, times and images are right, rse-pf check says")
@@ -166,7 +171,7 @@ def _show_overview(overview: Overview, request: ReplayRequest) -> None:
     for trouble in overview.troubles:
         show(f"  {trouble.kind:<10} {trouble.id}  {trouble.robot}  {trouble.what}")
     if bad > len(overview.troubles):
-        show(f"  and {bad - len(overview.troubles)} more; --json lists up to {_LISTED_IN_JSON}")
+        show(f"  and {bad - len(overview.troubles)} more; --json lists up to {_MAX_TROUBLES_IN_JSON}")
     show("", f"look at one: rse-pf replay {request.file} --command {overview.troubles[0].id}")
 
 

@@ -21,6 +21,7 @@ __all__ = ["html_page"]
 
 # Content security policy of the page: no scripts, and no requests.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+# Style sheet of the page.
 _STYLE = """
 :root { color-scheme: light dark;
   --paper: #ffffff; --ink: #1e222a; --pale: #5b6472; --line: #d4d8de; --panel: #f4f6f8;

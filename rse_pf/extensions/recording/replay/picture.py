@@ -27,6 +27,7 @@ _WIDTH_PX = 960  # width of the picture
 _MIN_HEIGHT_PX = 120  # smallest height of the picture, for malformed sizes of the camera
 _MAX_HEIGHT_PX = 1920  # largest height of the picture, for malformed sizes of the camera
 _BACKGROUND = (238, 240, 243)  # colour of the picture without a thumbnail
+# White: blended with the thumbnail, and the outline of the dots.
 _WHITE = (255, 255, 255)
 _MAX_DRAWN = 5000  # largest number of matches that are drawn: bounds the time
 _MIN_DEPTH_M = 1e-6  # smallest depth of a point that is projected: others are behind the camera

@@ -30,13 +30,13 @@ answer after the deadline."""
 _EXPIRED_CODES = {"expired": "expired", "stale": "expired", "cancelled": "expired"}
 # Fewest world points that two commands must have in common: fewer show that their world frames may differ.
 _MIN_COMMON_POINTS = 8
-_KEPT_TIMES = 10  # number of the newest commands of a robot from whose times its period is computed
+_PERIOD_COMMANDS = 10  # number of the newest commands of a robot from whose times its period is computed
 _MAX_SPEED_M_S = 3.0  # largest speed of a robot that is no jump, m/s
 _MAX_ROTATION_DEG_S = 180.0  # largest angular rate of a robot that is no jump, degrees per second
 _MIN_JUMP_M = 0.3  # smallest translation that is a jump, metres: noise is smaller
 _MIN_JUMP_DEG = 15.0  # smallest rotation that is a jump, degrees: noise is smaller
 # Largest difference from odometry that is no jump, as a share of the motion by odometry.
-_ODOMETRY_SHARE = 0.3
+_MAX_ODOMETRY_DIFFERENCE = 0.3
 
 
 class Trouble(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,7 +76,7 @@ class RobotHistory:
 
     def __init__(self) -> None:
         self._last: _Answered | None = None
-        self._sent_s: deque[float] = deque(maxlen=_KEPT_TIMES)
+        self._sent_s: deque[float] = deque(maxlen=_PERIOD_COMMANDS)
 
     def classify(self, command: RecordedCommand) -> Trouble | None:
         """Return what went wrong with *command*, None if nothing did; commands are passed in their order."""
@@ -142,8 +142,8 @@ class RobotHistory:
             expected = inverse(last.T_odom_camera) @ odometry
             metres, degrees = pose_difference(moved, expected)
             way_m, way_deg = pose_difference(expected, np.eye(4))
-            most_m = max(_MIN_JUMP_M, _ODOMETRY_SHARE * way_m)
-            most_deg = max(_MIN_JUMP_DEG, _ODOMETRY_SHARE * way_deg)
+            most_m = max(_MIN_JUMP_M, _MAX_ODOMETRY_DIFFERENCE * way_m)
+            most_deg = max(_MIN_JUMP_DEG, _MAX_ODOMETRY_DIFFERENCE * way_deg)
             against = "against odometry"
         else:
             metres, degrees = pose_difference(moved, np.eye(4))
