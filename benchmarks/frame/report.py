@@ -35,7 +35,7 @@ class Bar:
 
     @property
     def limit(self) -> str:
-        """The limit as text."""
+        """The limit of the bar as text, with its unit."""
         if self.at_most is not None:
             return f"<= {self.at_most:g} {self.unit}".strip()
         if self.at_least is not None:

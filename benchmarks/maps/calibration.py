@@ -43,7 +43,8 @@ from rse_pf.errors import CommandFailed
 from rse_pf.geometry import Camera
 from rse_pf.images import load_opencv
 
-WIDTH, HEIGHT = 640, 480  # size of the rendered images, px
+WIDTH = 640  # width of the rendered images, px
+HEIGHT = 480  # height of the rendered images, px
 RENDERED_FRAMES = 150  # number of frames rendered for each lens: 10 m of path
 TRACKED_FRAMES = 120  # most frames of a drive that is tracked
 FIRST_FRAMES = (0, 5, 10)  # first frames of the tracked drives

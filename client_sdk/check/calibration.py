@@ -52,7 +52,7 @@ _MIN_ERRORS = np.array([0.02, 0.02, 6.0, 6.0, 0.045, 0.015, 0.02])
 """Smallest errors that are reported, of the first seven `UNKNOWNS`: good calibrations have smaller ones."""
 _MAX_BOUNDS = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
 """Largest bounds (three standard deviations), of the first seven `UNKNOWNS`, with which a drive determines an
-error: if its bound is larger, the fault is listed as one that the drive cannot show."""
+error: with a larger bound, the fault is listed as undetermined."""
 # Smallest rotation of the camera about an axis, degrees, that determines focal length and principal point.
 _MIN_ROTATION_DEG = 12.0
 # Factor on the standard deviations between parts of a drive, which two to four parts often underestimate.

@@ -45,7 +45,7 @@ _MAX_BODY_BYTES = 4096
 # Accepted values of the header Host: loopback with any port, since a port may be forwarded (ssh -L).  A page
 # of another site whose name resolves to loopback (DNS rebinding) has the name of that site in Host.
 _LOOPBACK_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
-# Topics of the stream, besides "live/MAP".
+# Topics of the stream of the page, in addition to "live/MAP".
 _TOPICS = frozenset(("fleet", "history", "robots", "event", "audit", "pose", "link", "maps"))
 # Beginning of the topics of live maps; the name of the map follows.
 _LIVE = "live/"

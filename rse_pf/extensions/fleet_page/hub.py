@@ -24,7 +24,7 @@ _STORED_ROWS = 500
 _MAX_WAITING = 2000
 # Largest number of values that are stored; above it, the oldest value is dropped.
 _MAX_KEYS = 2048
-# Time without a message after which a page gets an empty one, in seconds, so that it sees a working
+# Time without a message, in seconds, after which a page gets an empty message, so that it can detect a lost
 # connection.
 _HEARTBEAT_S = 5.0
 

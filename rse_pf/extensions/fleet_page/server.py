@@ -32,7 +32,7 @@ ANNOUNCEMENT = "fleet_page.json"
 _LOOPBACK = "127.0.0.1"
 # Largest number of connections that have sent no request yet, and the same of idle ones after a request.
 _MAX_SILENT = 2 * MAX_PAGES
-# Largest number of all connections.
+# Largest number of connections of the page's server, of any kind.
 _MAX_CONNECTIONS = 4 * MAX_PAGES + 2 * _MAX_SILENT
 # Longest wait for open requests when the server stops, in seconds.
 _STOP_TIMEOUT_S = 1

@@ -176,7 +176,7 @@ class RobotRecorder:
         rgb: npt.NDArray[np.uint8] | None = None,
         T_odom_camera: npt.NDArray[np.float64] | None = None,
     ) -> None:
-        """Record a frame; one without thumbnail and odometry is only counted.
+        """Record a frame; a frame without thumbnail and odometry is only counted.
 
         Args:
             timestamp_s: Time of the frame by the robot's clock.

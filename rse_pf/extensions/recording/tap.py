@@ -164,7 +164,7 @@ class RecordingTap:
         self._append(CLOSED, connection, b"")
 
     def observe_received(self, connection: int, data: bytes) -> None:
-        """Record a message from the robot; it is dropped if too much is waiting."""
+        """Record a message from the robot; it is dropped if 8 MiB wait for the recorder already."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(UP, connection, data)
         else:
@@ -185,7 +185,7 @@ class RecordingTap:
                 self._describe_newest(DECODED_COMMAND, data, _DECODED_HEAD.pack(command.id, len(text)) + text)
 
     def observe_sent(self, connection: int, data: bytes) -> None:
-        """Record a message to the robot; it is dropped if too much is waiting."""
+        """Record a message to the robot; it is dropped if 8 MiB wait for the recorder already."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(DOWN, connection, data)
         else:

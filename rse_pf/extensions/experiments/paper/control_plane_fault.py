@@ -38,7 +38,7 @@ from rse_pf.local.state import PlatformState, read_state, remove_keys, state_fol
 __all__ = ["run_control_plane_fault"]
 
 # Name of the local platform.
-_NAME = "experiment"
+_PLATFORM_NAME = "experiment"
 # Number of servers of the platform.
 _SERVERS = 2
 # Seconds under load before the control plane is killed.
@@ -71,7 +71,7 @@ async def run_control_plane_fault(
         CommandFailed: The platform did not start, or did not start again.
     """
     home = folder / "platform"
-    state_at = state_folder(_NAME, {"XDG_STATE_HOME": str(home)})
+    state_at = state_folder(_PLATFORM_NAME, {"XDG_STATE_HOME": str(home)})
     origin_s = time.monotonic()
     timeout_s = settings.local.start_timeout_s
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
@@ -130,7 +130,17 @@ def _launch(home: Path, settings: PlatformSettings, folder: Path) -> subprocess.
     file = folder / "settings.json"
     if not file.exists():
         file.write_text(json.dumps({"context": {"rse-pf": settings.to_dict()}}), encoding="utf-8")
-    command = ("local", "--name", _NAME, "--servers", str(_SERVERS), "--port", "0", "--settings", str(file))
+    command = (
+        "local",
+        "--name",
+        _PLATFORM_NAME,
+        "--servers",
+        str(_SERVERS),
+        "--port",
+        "0",
+        "--settings",
+        str(file),
+    )
     with (folder / "control-plane.log").open("ab") as output:
         return subprocess.Popen(
             [*RSE_PF, *command],
