@@ -136,8 +136,7 @@ class Bridge:
         self._T_map_world: Array | None = None
         self._last_s = float("-inf")
         self._reason = ""
-        self._cloud: asyncio.Task[None] | None = None
-        self._plan: asyncio.Task[None] | None = None
+        self._tasks: dict[str, asyncio.Task[None]] = {}
         self._plan_trouble = ""
         self._maps: MapServices | None = None
         self._seen: Camera | None = None
@@ -205,7 +204,7 @@ class Bridge:
             for task in done:
                 task.result()
         finally:
-            ending = [*running, *(task for task in (self._cloud, self._plan) if task is not None)]
+            ending = [*running, *self._tasks.values()]
             for task in ending:
                 task.cancel()
             await asyncio.gather(*ending, return_exceptions=True)
@@ -350,24 +349,28 @@ class Bridge:
             self._publish(message)
 
     def _publish_map(self, mapper: Mapper | LiveMapper, stamp_ns: int) -> None:
-        """Publish path and cloud if they are due, and the pose of the mapper's world in the map is known."""
-        now, T_map_world = self._clock(), self._T_map_world
+        """Publish what is due of path, cloud and floor plan, once the world has a pose in the map."""
+        T_map_world, options = self._T_map_world, self._options
         if T_map_world is None:
             return
-        if now >= self._due["path"]:
-            self._due["path"] = now + _PATH_EVERY_S
-            for message in self._outgoing.path(T_map_world):
-                self._publish(message)
-        if now >= self._due["cloud"] and (self._cloud is None or self._cloud.done()):
-            self._due["cloud"] = now + self._options.cloud_every_s
-            self._cloud = asyncio.create_task(self._publish_cloud(mapper, stamp_ns, T_map_world))
+        if self._is_due("path", _PATH_EVERY_S):
+            self._start("path", self._publish_path(T_map_world))
+        if self._is_due("cloud", options.cloud_every_s):
+            self._start("cloud", self._publish_cloud(mapper, stamp_ns, T_map_world))
+        every_s = options.floor_plan_every_s
+        if every_s > 0 and not isinstance(mapper, LiveMapper) and self._is_due("floor plan", every_s):
+            self._start("floor plan", self._publish_floor_plan(mapper, stamp_ns))
 
-        every_s = self._options.floor_plan_every_s
-        is_plan_due = every_s > 0 and now >= self._due["floor plan"]
-        is_plan_done = self._plan is None or self._plan.done()
-        if is_plan_due and is_plan_done and not isinstance(mapper, LiveMapper):
-            self._due["floor plan"] = now + every_s
-            self._plan = asyncio.create_task(self._publish_floor_plan(mapper, stamp_ns))
+    def _is_due(self, name: str, every_s: float) -> bool:
+        """Return whether the message *name* is to be made now, and then set the time of the next one."""
+        now, task = self._clock(), self._tasks.get(name)
+        if now < self._due[name] or (task is not None and not task.done()):
+            return False
+        self._due[name] = now + every_s
+        return True
+
+    def _start(self, name: str, work: Coroutine[Any, Any, None]) -> None:
+        self._tasks[name] = asyncio.create_task(work)
 
     def _publish_imu_pose(self, images: PairedImages) -> None:
         """Publish the IMU's pose in the camera frame once, when it and the IMU's frame name are known."""
@@ -441,6 +444,10 @@ class Bridge:
             # The segment is not aligned yet, and continues one that is: the wheels have carried the pose.
             T_map_world = tracked.T_map_camera @ inverse(pose)
         return T_map_world, mapper.covariance
+
+    async def _publish_path(self, T_map_world: Array) -> None:
+        for message in await asyncio.to_thread(self._outgoing.path, T_map_world):
+            self._publish(message)
 
     async def _publish_cloud(self, mapper: Mapper | LiveMapper, stamp_ns: int, T_map_world: Array) -> None:
         def made() -> list[Message]:

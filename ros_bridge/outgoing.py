@@ -59,13 +59,16 @@ def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
 
 
 class OutgoingMessages:
-    """Makes the ROS messages of one robot, and stores the robot's path for them."""
+    """Makes the ROS messages of one robot, and stores the robot's path for them.
+
+    One thread at a time may call `path`, also while another one calls other methods.
+    """
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions, frames: RobotFrames) -> None:
         self._maker, self._options, self._frames = maker, options, frames
         self._path: list[tuple[int, Array]] = []
         self._made_path: list[Any] = []
-        self._T_map_world: Array | None = None
+        self._made_for: tuple[object, Array] | None = None
         self._every = 1
         self._counted = 0
 
@@ -101,15 +104,18 @@ class OutgoingMessages:
 
         *T_map_world* ``(4, 4)`` is the pose of the mapper's world in the map: a correction moves the path.
         """
-        if not self._path:
+        path = self._path  # a list that only grows: a change of its poses makes another one
+        poses = path[:]
+        if not poses:
             return []
-        if self._T_map_world is None or not np.array_equal(self._T_map_world, T_map_world):
-            self._T_map_world, self._made_path = T_map_world, []
-        for stamp_ns, T_world_base in self._path[len(self._made_path) :]:
+        made_for = self._made_for
+        if made_for is None or made_for[0] is not path or not np.array_equal(made_for[1], T_map_world):
+            self._made_for, self._made_path = (path, T_map_world), []
+        for stamp_ns, T_world_base in poses[len(self._made_path) :]:
             pose = T_map_world @ T_world_base
             pose = planar_pose(pose) if self._frames.is_planar else pose
             self._made_path.append(self._maker.pose(stamp_ns, self._frames.map, pose))
-        made = self._maker.path_of(self._path[-1][0], self._frames.map, self._made_path)
+        made = self._maker.path_of(poses[-1][0], self._frames.map, self._made_path)
         return [self._message("rse_pf/path", PATH, made)]
 
     def extend_path(self, stamp_ns: int, T_world_base: Array) -> None:
@@ -123,12 +129,12 @@ class OutgoingMessages:
             return
         self._path.append((stamp_ns, T_world_base))
         if len(self._path) > self._options.path_poses:
-            self._path, self._made_path = self._path[::2], []
+            self._path = self._path[::2]
             self._every *= 2
 
     def move_path(self, T_new_old: Array) -> None:
         """Transform the path into the mapper's new world by *T_new_old* ``(4, 4)``."""
-        self._path, self._made_path = [(stamp_ns, T_new_old @ T) for stamp_ns, T in self._path], []
+        self._path = [(stamp_ns, T_new_old @ T) for stamp_ns, T in self._path]
 
     def cloud(
         self,
