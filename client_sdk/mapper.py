@@ -283,11 +283,12 @@ class Mapper:
 
     @property
     def map(self) -> PointMap:
-        """Points so far of segment 0 and of all segments that were joined to it.
+        """Points so far of segment 0 and of all segments that were joined to it, or connected by wheels.
 
         They are depth readings, features of stereo pairs, or landmarks of a camera without depth.
         With depth this is the map itself: later frames are added to it.  A turn of the world or an adjustment
-        makes another map, and one that was returned before gets no more frames.  Of a camera without depth it
+        makes another map, and one that was returned before gets no more frames; once wheels have connected a
+        segment, it is made anew at each access.  Of a camera without depth it
         is made anew from the landmarks at each access, and later frames do not change it.
         """
         tracker = self._tracker
@@ -297,9 +298,12 @@ class Mapper:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of segment 0 and of all segments that were joined to it, with all corrections."""
+        """Poses of segment 0 and of all segments that were joined to it, with all corrections.
+
+        Segments that wheels have connected with it belong to it; poses that wheels have carried do not.
+        """
         if isinstance(self._tracker, MonocularTracker):
-            return self._read_segments(self._tracker).trajectory()
+            return self._tracker.world_trajectory()
         return self._records.trajectory()
 
     @property

@@ -89,7 +89,8 @@ class WheelCheck:
 
     def add(self, timestamp_s: float, T_world_base: Array, world: object) -> bool:
         """Add the tracked pose of a frame; return whether it ends a window, for `close`."""
-        if world != self._world or (self._poses and timestamp_s - self._poses[-1][0] > _MAX_WINDOW_S):
+        since_s = timestamp_s - self._poses[-1][0] if self._poses else 0.0
+        if world != self._world or not 0.0 < since_s <= _MAX_WINDOW_S:
             self._poses.clear()
             self._headings.clear()
         self._world = world

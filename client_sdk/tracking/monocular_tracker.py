@@ -316,14 +316,15 @@ class MonocularTracker:
         """
         self._open.refuse_open()
         self.frames += 1
-        self.lost_frames += 1
+        self.lost_frames += bool(self._segments)
+        self.starting_frames += not self._segments
         return TrackedFrame(
             frame=frame,
             T_world_camera=None,
             keyframe=False,
             inliers=0,
             matches=0,
-            status="lost",
+            status="lost" if self._segments else "starting",
             reason=REPEATED,
             segment=self.segment,
             scale="up to scale",
@@ -364,6 +365,13 @@ class MonocularTracker:
             return Trajectory(np.empty(0), np.empty((0, 4, 4)))
         path = self._segments[segment].trajectory()
         return Trajectory(path.timestamps_s, self._T_world_start @ path.T_world_camera)
+
+    def world_trajectory(self) -> Trajectory:
+        """Return the poses of segment 0, and of all segments that wheels have connected with its world."""
+        paths = [self.trajectory(segment) for segment in (0, *sorted(self.connected))]
+        stamps_s = np.concatenate([path.timestamps_s for path in paths])
+        order = np.argsort(stamps_s, kind="stable")
+        return Trajectory(stamps_s[order], np.concatenate([path.T_world_camera for path in paths])[order])
 
     def points(self, segment: int = 0) -> tuple[Array, npt.NDArray[np.uint8]]:
         """Return the ``(n, 3)`` landmarks of a segment in the world and their ``(n, 3)`` uint8 colours.

@@ -26,7 +26,8 @@ SDK = {
     ),
     "Track and map": (
         "Mapper", "BlockingMapper", "TrackedFrame", "Frame", "FrontEndOptions", "MonocularOptions",
-        "MarkerScale", "OdometryScale", "Tracker", "PoseQuery", "MapOptions", "PointMap", "Trajectory",
+        "MarkerScale", "OdometryScale", "OdometryReading", "Tracker", "PoseQuery", "MapOptions", "PointMap",
+        "Trajectory",
     ),
     "Recordings": ("Dataset", "open_dataset"),
     "Large data": ("DataClient", "DataOptions"),
