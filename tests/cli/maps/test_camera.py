@@ -16,6 +16,7 @@ from client_sdk.rigs.rig_file import read_intrinsics
 from rse_pf.cli.main import main
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, transform
+from tests.kit.removed_extensions import skip_if_removed
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -140,6 +141,7 @@ def test_the_pdf_has_the_true_size(tmp_path: Path) -> None:
 
 
 def test_check_says_size_rate_depth_and_blur(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    skip_if_removed("camera check")
     writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
     for pose in poses(4):
         writer.write(cv2.cvtColor(view(pose), cv2.COLOR_GRAY2BGR))
@@ -167,6 +169,7 @@ def test_check_says_size_rate_depth_and_blur(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_check_says_that_a_recording_has_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    skip_if_removed("camera check")
     kitti = tmp_path / "06"
     for camera in ("image_0", "image_1"):
         (kitti / camera).mkdir(parents=True)

@@ -15,7 +15,7 @@ from rse_pf.cli.main import main
 from tests.kit.removed_extensions import skip_if_removed
 from tests.kit.wrong_inputs import WRONG_INPUTS, WrongInput, make_files
 
-TYPED_IN_A_SHELL = ("demos", "settings --settings misspelt.json", "map list --store dir:/typo")
+TYPED_IN_A_SHELL = ("maps", "settings --settings misspelt.json", "map list --store dir:/typo")
 AS_PROCESSES = [each for each in WRONG_INPUTS if each.typed in TYPED_IN_A_SHELL]
 
 
