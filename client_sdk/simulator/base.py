@@ -56,6 +56,9 @@ _LOOK_AHEAD_M = 0.4  # pure pursuit steers to the point of the route at this dis
 _TURN_IN_PLACE_RAD = 0.8  # a larger angle to that point is turned at rest
 _REACHED_M = 0.1  # a route ends this near to its last point
 _PROGRESS_POINTS = 60  # points of a route, 1 cm apart, among which the nearest one is searched in a step
+_MAX_STEPS_PER_POINT = 5
+"""Steps for each point of a route (1 cm) after which a drive ends, so that a base that is stuck does not
+drive for ever: 5 cm/s."""
 _REST_STEPS = 25  # steps at rest before a drive begins: 1 s
 
 Lie = Literal["none", "scale", "blocked", "late", "frozen"]
@@ -202,12 +205,15 @@ class BaseDrive:
 
 
 def drive_route(building: Building, route: Array) -> BaseDrive:
-    """Drive along a route ``(n, 2)`` of `Building.route` by pure pursuit, after 1 s at rest."""
+    """Drive along a route ``(n, 2)`` of `Building.route` by pure pursuit, after 1 s at rest.
+
+    The drive ends at the last point of the route, or unfinished where the base is stuck.
+    """
     yaw_rad = math.atan2(*(route[10] - route[0])[::-1])
     base = DifferentialBase(building, float(route[0, 0]), float(route[0, 1]), yaw_rad)
     poses, wheels = [base.T_building_base], list[tuple[float, float]]()
     progress, is_at_end = 0, False
-    while not is_at_end or len(wheels) % FRAME_STEPS:
+    while len(wheels) % FRAME_STEPS or not (is_at_end or len(wheels) > _MAX_STEPS_PER_POINT * len(route)):
         near = route[progress : progress + _PROGRESS_POINTS]
         progress += int(np.argmin(np.hypot(near[:, 0] - base.x_m, near[:, 1] - base.y_m)))
         ahead = route[min(progress + round(100 * _LOOK_AHEAD_M), len(route) - 1)]
