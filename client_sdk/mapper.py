@@ -683,6 +683,7 @@ class Mapper:
                 self._depth_source = "depth" if frame.stereo is None else "stereo"
                 self._tracker = Tracker(self._options, self._T_world_start, self._plugins)
             else:
+                self._base_covariance.expect_one_lens()
                 if self._scale is None and self._wheels is not None:
                     self._scale = OdometryScale()
                 self._tracker = MonocularTracker(self._monocular_options, self._T_world_start, self._plugins)

@@ -36,6 +36,8 @@ are 0.4 m apart and differ by 1 %."""
 _DRIFT_SHARE = 0.01
 """Standard deviation of the position by visual odometry, as a share of the distance since the last
 correction: the trackers drift by 0.3 to 1 % on recorded drives."""
+_ONE_LENS_DRIFT_SHARE = 0.05
+"""The same for one lens, whose scale drifts: 5 to 7 % on a rendered drive of 5 m."""
 _DRIFT_RAD = math.radians(0.3)
 """Standard deviation of the rotation by visual odometry after one metre, in rad; it grows with the root of
 the distance since the last correction."""
@@ -261,6 +263,7 @@ class BaseCovariance:
 
     def __init__(self) -> None:
         """Begin with a pose that is certain."""
+        self._drift_share = _DRIFT_SHARE
         self._begin: Array = np.zeros((6, 6))
         self._before: Array = np.zeros((6, 6))
         self._begin_position: Array | None = None
@@ -268,6 +271,10 @@ class BaseCovariance:
         self._distance_m = 0.0
         self._last: Array = np.zeros((6, 6))
         self._last_position: Array = np.zeros(3)
+
+    def expect_one_lens(self) -> None:
+        """Expect the drift of a camera without depth."""
+        self._drift_share = _ONE_LENS_DRIFT_SHARE
 
     def correct(self) -> None:
         """Begin anew with the covariance before the present segment: a recognised place removes its drift."""
@@ -300,7 +307,7 @@ class BaseCovariance:
             self._distance_m, self._counted_position = self._distance_m + step_m, position
         # 2. Carry the covariance of the begin to here, and add the drift.
         covariance = _moved(self._begin, position - self._begin_position)
-        variance_m2 = _MIN_DEVIATION_M**2 + (_DRIFT_SHARE * self._distance_m) ** 2
+        variance_m2 = _MIN_DEVIATION_M**2 + (self._drift_share * self._distance_m) ** 2
         variance_rad2 = _MIN_DEVIATION_RAD**2 + _DRIFT_RAD**2 * self._distance_m
         covariance[np.diag_indices(6)] += np.repeat((variance_m2, variance_rad2), 3)
         # 3. Add the covariance of the frame, which is that of a twist in the frame of the camera.
