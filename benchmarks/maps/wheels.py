@@ -151,8 +151,8 @@ def ate_cm(drive: Drive, poses: Sequence[Array | None], rows: Sequence[int]) -> 
 
 
 def ratio(value: float | None, base: float | None) -> float | None:
-    """Return *value* over *base*; None without either."""
-    return None if value is None or base is None else value / base
+    """Return *value* over *base* to three digits; None without either."""
+    return None if value is None or base is None else round(value / base, 3)
 
 
 def wheel_poses(readings: Readings) -> list[Array]:

@@ -39,7 +39,7 @@ GRID_FRAMES = 8  # images from one floor plan to the next: 1.6 s
 GOAL_S = 150.0  # longest time for a goal
 CLEARANCE_M = RADIUS_M + 0.06  # distance that a path keeps from obstacles: the robot, and a cell for noise
 COMFORT_M = 0.45  # cells nearer to an obstacle than this cost more, so that paths keep to the middle
-NEAR_COST, UNKNOWN_COST, BLOCKED_COST = 3.0, 2.0, 30.0  # cost of a cell; that of a free one is 1
+NEAR_COST, UNKNOWN_COST, TIGHT_COST = 3.0, 2.0, 30.0  # cost of a cell; that of a free one is 1
 LOOK_AHEAD_M = 0.4  # the robot steers to the point of its path at this distance
 ARRIVED_M, ARRIVED_RAD = 0.04, 0.05  # the robot stops at this distance from a goal and its direction
 SLOW_M = 0.6  # nearer to a goal than this, the speed falls with the distance
@@ -65,12 +65,13 @@ def plan(grid: OccupancyGrid, start: Array, goal: Array) -> Array | None:
     is_occupied = cells == OCCUPIED
     cost = np.where(cells == FREE, 1.0, UNKNOWN_COST)
     cost[grown(is_occupied, COMFORT_M / grid.resolution_m)] *= NEAR_COST
-    is_blocked = grown(is_occupied, CLEARANCE_M / grid.resolution_m)
+    is_tight, is_blocked = (grown(is_occupied, far / grid.resolution_m) for far in (CLEARANCE_M, RADIUS_M))
     (x0, y0), (x1, y1) = (np.floor((point - low) / grid.resolution_m).astype(int) for point in (start, goal))
     y, x = np.mgrid[:height, :width]
     near_ends = np.minimum(np.hypot(y - y0, x - x0), np.hypot(y - y1, x - x1)) * grid.resolution_m < 0.3
+    cost[is_tight] = TIGHT_COST
     cost[is_blocked] = np.inf
-    cost[is_blocked & near_ends & ~is_occupied] = BLOCKED_COST
+    cost[is_blocked & near_ends & ~is_occupied] = TIGHT_COST
     # 3. Search.
     found = search(cost, (int(y0), int(x0)), (int(y1), int(x1)))
     return None if found is None else low + (np.array(found)[:, ::-1] + 0.5) * grid.resolution_m
