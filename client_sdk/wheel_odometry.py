@@ -21,6 +21,7 @@ __all__ = ["BaseCovariance", "OdometryReading", "WheelMotion", "WheelOdometry"]
 _MAX_EXTRAPOLATION_S = 0.1
 """Longest time after the newest reading, in seconds, for which its velocity is assumed to continue: a robot
 that brakes at 3 m/s^2 is then 1.5 cm from there."""
+_SAME_TIME_S = 1e-6  # a reading is that of a frame if their times differ by at most this, in seconds
 _MAX_GAP_S = 1.0
 """Longest time between two readings, in seconds, between which a pose is interpolated: in a longer one the
 robot may have turned and come back."""
@@ -203,6 +204,10 @@ class WheelOdometry:
         is_outside = not begin_s - _MAX_EXTRAPOLATION_S <= timestamp_s <= end_s + _MAX_EXTRAPOLATION_S
         if is_outside or (end_s - begin_s > _MAX_GAP_S and timestamp_s not in (begin_s, end_s)):
             return None
+        for row, known_s in ((after, end_s), (after - 1, begin_s)):
+            if abs(timestamp_s - known_s) <= _SAME_TIME_S:
+                known: Array = self._poses[row].copy()
+                return known
         # Between two readings the robot turns little: a matrix in between is nearly a rotation.
         share = (timestamp_s - begin_s) / (end_s - begin_s)
         return orthonormalise((1.0 - share) * self._poses[after - 1] + share * self._poses[after])
