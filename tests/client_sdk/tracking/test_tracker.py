@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from client_sdk.datasets import open_dataset
-from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.frontend import Frame, FrontEndOptions, MonocularOptions, PoseQuery, TrackedFrame
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
@@ -139,12 +139,15 @@ def test_a_place_that_the_camera_cannot_have_reached_is_not_recognised_until_it_
     assert later.segment == 0
 
 
-@pytest.mark.parametrize("kind", [Tracker, MonocularTracker], ids=["depth", "one lens"])
+@pytest.mark.parametrize(
+    "tracker",
+    [Tracker(FrontEndOptions(segment_after=3)), MonocularTracker(MonocularOptions(segment_after=3))],
+    ids=["depth", "one lens"],
+)
 def test_a_segment_out_of_reach_is_joined_once_the_camera_has_moved_farther_than_the_places_are_apart(
-    kind: type[Tracker] | type[MonocularTracker],
+    tracker: Tracker | MonocularTracker,
 ) -> None:
-    tracker = kind(FrontEndOptions(segment_after=3))
-    shown = functools.partial(frame_at, depth=kind is Tracker)
+    shown = functools.partial(frame_at, depth=isinstance(tracker, Tracker))
     run_all(tracker, map(shown, range(35)))
     back = [replace(shown(row), timestamp_s=3.5 + 0.1 * n) for n, row in enumerate(range(66, 2, -1))]
 
