@@ -1,7 +1,8 @@
 """Track a camera frame by frame, and keep its trajectory and its map.
 
 `Mapper` is what a robot with one camera needs.  It opens neither a connection nor a camera: it gets frames,
-and a function that answers pose queries, such as `ask_robot` makes of a connected robot.
+and a function that answers pose queries, such as `client_sdk.pose_answers.ask_robot` makes of a connected
+robot.
 
 **Choice of the tracker.**  The first frame decides.  A frame with depth or with a right image is tracked by
 `client_sdk.tracking.tracker.Tracker`, in metres.  A frame without a right image and without depth (all depths
@@ -26,7 +27,7 @@ import asyncio
 import functools
 import json
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -40,6 +41,7 @@ from client_sdk.imu.samples import ImuSamples
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Plugins
 from client_sdk.point_map import MapOptions, PointMap, write_ply
+from client_sdk.pose_answers import AskPose
 from client_sdk.recording import RobotRecorder
 from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
 from client_sdk.tracking.monocular_tracker import MonocularTracker
@@ -57,53 +59,20 @@ from client_sdk.wheel_odometry import BaseCovariance, OdometryReading, WheelOdom
 from rse_pf.errors import ConfigurationError, PnpError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera, orthonormalise
 from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
-from rse_pf.pnp import DepthNoise, PnpOptions
+from rse_pf.pnp import DepthNoise
 from rse_pf.slam.inertial import KeyframeImu, upright_rotation
 from rse_pf.slam.occupancy import GridOptions, OccupancyGrid, make_occupancy_grid
 
-__all__ = ["AskPose", "Mapper", "ask_robot"]
-
-
-AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
-"""Function that answers one pose query.
-
-If the function raises an RsePfError, the query counts as not answered.  `Mapper.track` passes on a
-ConfigurationError (such as a UsageError) and every exception that is no RsePfError.
-"""
+__all__ = ["Mapper"]
 
 _MIN_READINGS = 2  # readings that a voxel of a dense map needs to be saved: single ones are mostly noise
 _UP_TO_SCALE: Final = "up to scale"
-_GRAVITY_OF_LEVEL_CAMERA: Array = np.array([0.0, 9.81, 0.0])
-"""Gravity in m/s^2 in the frame of a level camera, whose y axis points down.  It is assumed for the first
-camera if the first IMU samples cannot measure gravity, because the camera moved."""
 _MAX_PLAN_LINES = 40_000
 """Largest number of lines of sight that mark free cells of a floor plan while the robot drives: a tenth of
 those of an exported plan, since the floor itself marks most free cells."""
 _DEFAULT_DEPTH_M = 2.0
 """Median depth in metres that is assumed when the last frame of a tracker with depth has no feature with
 depth, to compute the noise of positions for the IMU."""
-
-
-def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float | None = None) -> AskPose:
-    """Return a function that answers pose queries with `Robot.solve_pnp`, each within *deadline_s* seconds.
-
-    None means ``session.answer_timeout_s``.  Queries have ``keep``: newer ones do not replace a query.
-    """
-
-    async def ask(query: PoseQuery) -> PoseAnswer:
-        correspondences = query.correspondences
-        return await solve_pnp(
-            correspondences.points_world,
-            correspondences.pixels,
-            query.camera,
-            PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations),
-            depths_m=correspondences.depths_m if correspondences.depths_m.any() else None,
-            depth_noise=query.depth_noise,
-            deadline_s=deadline_s,
-            keep=True,
-        )
-
-    return ask
 
 
 class Mapper:
@@ -696,10 +665,7 @@ class Mapper:
         self._plugins = replace(self._plugins, inertial=self._imu)
         self._scale = self._scale or ImuScale(self._imu)
         if self._T_world_start is None:
-            gravity_camera = self._imu.stationary_gravity()
-            self._T_world_start = level_start_pose(
-                _GRAVITY_OF_LEVEL_CAMERA if gravity_camera is None else gravity_camera
-            )
+            self._T_world_start = level_start_pose(self._imu.stationary_gravity())
 
     def _is_repeated(self, frame: Frame) -> bool:
         """Return whether an image repeats although the wheels have moved since it came first."""

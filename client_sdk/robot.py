@@ -383,7 +383,8 @@ class Robot:
         a command of 10 kB in this robot's codec.
         """
         from client_sdk.frontend import FrontEndOptions
-        from client_sdk.mapper import Mapper, ask_robot
+        from client_sdk.mapper import Mapper
+        from client_sdk.pose_answers import ask_robot
 
         limited_options = (options or FrontEndOptions()).sent_with(self._session.codec.name)
         return Mapper(
@@ -431,7 +432,7 @@ class Robot:
         from client_sdk.frontend import FrontEndOptions
         from client_sdk.live.live_mapper import LiveMapper
         from client_sdk.live.options import LiveOptions
-        from client_sdk.mapper import ask_robot
+        from client_sdk.pose_answers import ask_robot
 
         codec = self._session.codec.name
         limited_options = (options or FrontEndOptions.live()).sent_with(codec)

@@ -328,17 +328,20 @@ class ImuScale:
         return alignment.scale
 
 
-def level_start_pose(gravity_camera: Array) -> Array:
+def level_start_pose(gravity_camera: Array | None) -> Array:
     """Return the pose ``T_world_camera`` ``(4, 4)`` of the first frame, at the origin of a world with z up.
 
     A level camera looks along x.  The pose of a camera that is not level is that of a level one, rotated by
     the smallest angle with which gravity points down.
 
     Args:
-        gravity_camera: ``(3,)`` gravity in the frame of the camera, of any length above 0.
+        gravity_camera: ``(3,)`` gravity in the frame of the camera, of any length above 0; None, if it could
+            not be measured because the camera moved, assumes a level camera.
     """
     T_world_level = np.eye(4)
     T_world_level[:3, :3] = _R_WORLD_LEVEL_CAMERA
+    if gravity_camera is None:
+        return T_world_level
     T_world_camera: Array = upright_rotation(_R_WORLD_LEVEL_CAMERA @ gravity_camera) @ T_world_level
     return T_world_camera
 

@@ -43,9 +43,10 @@ from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, KeyframeSe
 from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.live.options import LiveOptions
 from client_sdk.live.relocaliser import Relocaliser
-from client_sdk.mapper import AskPose, Mapper
+from client_sdk.mapper import Mapper
 from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction
 from client_sdk.point_map import MapOptions, PointMap
+from client_sdk.pose_answers import AskPose
 from client_sdk.tracking.monocular_segment import AdjustedKeyframe
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.segment_join import carried_segment_after
@@ -106,7 +107,7 @@ class LiveMapper:
             robot: The robot that calls the services; it need not be connected yet.
             name: Name of the map: small letters, digits and hyphens.
             ask: Function that computes the pose of a frame from matches of image and cloud, such as that of
-                `client_sdk.mapper.ask_robot`.
+                `client_sdk.pose_answers.ask_robot`.
             camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
             depth: Whether to use depth.  None: if the first frame has some, or is a stereo pair.  With True a
                 first frame without depth is refused.

@@ -16,8 +16,9 @@ import pytest
 
 import client_sdk
 from client_sdk.commands.answer_types import PoseAnswer
-from client_sdk.mapper import Mapper, ask_robot
+from client_sdk.mapper import Mapper
 from client_sdk.point_map import read_ply
+from client_sdk.pose_answers import ask_robot
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.cli.main import main

@@ -14,7 +14,7 @@ from typing import Protocol
 
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import PoseQuery
-from client_sdk.mapper import ask_robot
+from client_sdk.pose_answers import ask_robot
 from client_sdk.robot import Robot
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import error_from_code

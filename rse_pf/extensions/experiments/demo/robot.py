@@ -21,10 +21,11 @@ import numpy as np
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
-from client_sdk.mapper import Mapper, ask_robot
+from client_sdk.mapper import Mapper
 from client_sdk.offloading.offload_policy import CloudFirst
 from client_sdk.plugins import load_features
 from client_sdk.point_map import write_ply
+from client_sdk.pose_answers import ask_robot
 from client_sdk.robot import Robot
 from client_sdk.source_facts import DoubtLog, unresolved
 from client_sdk.trajectory import Trajectory, write_trajectory
