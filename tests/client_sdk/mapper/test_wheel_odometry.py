@@ -137,6 +137,19 @@ def test_a_segment_after_a_long_loss_is_in_the_world_of_the_first_one() -> None:
     assert mapper.encoded_map()
 
 
+def test_a_place_that_looks_like_an_earlier_one_is_not_recognised_where_the_wheels_cannot_be() -> None:
+    drive = covered(short_drive(), 15, 50)
+    twin = replace(drive.frames[50], rgb=drive.frames[2].rgb, depth_m=drive.frames[2].depth_m)
+    drive = replace(drive, frames=[*drive.frames[:50], twin])
+
+    done = track_with_wheels(Mapper(ask=solve, T_base_camera=T_BASE_CAMERA), drive)
+    alone = track_with_wheels(Mapper(ask=solve, T_base_camera=T_BASE_CAMERA), drive, has_wheels=False)
+
+    assert base_errors_m(alone, drive)[-1] > 1.0
+    assert done[-1].pose_source == "odometry"
+    assert base_errors_m(done, drive)[-1] < 0.2
+
+
 def test_frames_that_the_platform_does_not_answer_begin_no_segment() -> None:
     drive = short_drive()
 
