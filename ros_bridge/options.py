@@ -139,11 +139,16 @@ class BridgeOptions:
         for name in ("depth_scale", "pair_within_s", "cloud_every_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise UsageError(f"{name} = {value:g} is not above 0", hint="leave it out for the default")
+                raise UsageError(
+                    f"{name} = {value:g} is not a finite number above 0", hint="leave it out for the default"
+                )
         for name in ("transform_tolerance_s", "max_correction_m_s", "floor_plan_every_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise UsageError(f"{name} = {value:g} is not 0 or above", hint="leave it out for the default")
+                raise UsageError(
+                    f"{name} = {value:g} is not a finite number of 0 or above",
+                    hint="leave it out for the default",
+                )
         if not 1 <= self.queue_frames <= 100 or not 10 <= self.path_poses <= 100_000:
             raise UsageError(
                 f"queue_frames = {self.queue_frames} or path_poses = {self.path_poses} is out of range",

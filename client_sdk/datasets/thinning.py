@@ -39,7 +39,9 @@ class Thinning:
             UsageError: The rate is not above 0.
         """
         if not (math.isfinite(rate_hz) and rate_hz > 0):
-            raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 5")
+            raise UsageError(
+                f"rate {rate_hz:g} is not a finite number above 0", hint="name frames per second, such as 5"
+            )
         self._period_s = 1.0 / rate_hz
         self._interval_s = interval_s
         self._recent: deque[float] = deque(maxlen=_INTERVAL_WINDOW)

@@ -328,7 +328,7 @@ def check_quotas(quotas: dict[str, float]) -> dict[str, float]:
             raise UsageError(f"{name[:80]!r} is not a quota", hint=f"known are {', '.join(QUOTAS)}")
         if not (math.isfinite(limit) and limit > 0):
             raise UsageError(
-                f"the quota {name} = {limit:g} is not above 0",
+                f"the quota {name} = {limit:g} is not a finite number above 0",
                 hint="write a number of bytes, or disable the robot",
             )
     return quotas

@@ -168,7 +168,8 @@ def test_a_frame_waits_for_the_sample_after_it_but_not_for_a_silent_imu(tmp_path
         ({"imu": "/imu"}, "where the IMU sits"),
         ({"map": "hall", "depth": ""}, "depth, or of right images"),
         ({"map": "hall", "floor_plan_every_s": "5"}, "in a live map publishes no floor plan"),
-        ({"transform_tolerance_s": "-1"}, "is not 0 or above"),
+        ({"transform_tolerance_s": "-1"}, "is not a finite number of 0 or above"),
+        ({"transform_tolerance_s": "inf"}, "is not a finite number of 0 or above"),
     ],
 )
 def test_what_is_missing_is_one_line(options: dict[str, str], says: str) -> None:

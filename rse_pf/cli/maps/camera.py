@@ -131,7 +131,8 @@ def calibrate_camera(request: _CalibrateRequest, settings: PlatformSettings) -> 
     if not request.max_rms_px > 0:
         raise UsageError(f"--max-rms-px {request.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
     if not request.file.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {request.file.absolute().parent}", hint="create it")
+        folder = request.file.absolute().parent
+        raise UsageError(f"--out: there is no folder {folder}", hint="create it")
     for source in request.sources:
         is_bag = Path(source).suffix in BAG_ENDINGS
         if is_bag or (source == "realsense" and is_device(source)):

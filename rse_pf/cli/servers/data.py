@@ -67,9 +67,10 @@ def run_data(request: DataRequest, settings: PlatformSettings) -> int:
             if value is not None
         }
     )
-    for file in (request.keys, request.announce):
+    for option_name, file in (("--keys", request.keys), ("--announce", request.announce)):
         if file is not None and not file.absolute().parent.is_dir():
-            raise UsageError(f"there is no folder {file.absolute().parent}", hint="create the folder")
+            folder = file.absolute().parent
+            raise UsageError(f"{option_name}: there is no folder {folder}", hint="create the folder")
     from rse_pf.data_server.server import KeysFile, serve_data
 
     store, keys = open_data_store(chosen), KeysFile(request.keys)

@@ -135,7 +135,7 @@ def run_server(request: ServeRequest, settings: PlatformSettings) -> int:
     token = None if request.control_token is None else read_control_token(request.control_token)
     if request.announce is not None and not request.announce.absolute().parent.is_dir():
         raise UsageError(
-            f"there is no folder {request.announce.absolute().parent}",
+            f"--announce: there is no folder {request.announce.absolute().parent}",
             hint="make it, or name another --announce",
         )
     trust = None if request.keys is None else _trust(request.keys)

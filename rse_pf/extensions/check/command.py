@@ -81,7 +81,7 @@ def check_drive(request: CheckDriveRequest, settings: PlatformSettings) -> int:
     if request.frames is not None and request.frames < 2:
         raise UsageError(f"--frames {request.frames} is below 2", hint="leave it out to look at all frames")
     if request.write is not None and not request.write.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {request.write.absolute().parent}", hint="create it")
+        raise UsageError(f"--write: there is no folder {request.write.absolute().parent}", hint="create it")
     folder = Path(request.source)
     results = folder / "report.json"
     if results.is_file() and not any((folder / name).exists() for name in _RECORDING_FILES):

@@ -43,7 +43,8 @@ class RosbridgeRequest:
 def run_rosbridge(request: RosbridgeRequest, settings: PlatformSettings) -> int:
     """Check the options, and serve until a signal ends the process; return the exit code."""
     if request.announce is not None and not request.announce.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {request.announce.absolute().parent}", hint="create the folder")
+        folder = request.announce.absolute().parent
+        raise UsageError(f"--announce: there is no folder {folder}", hint="create the folder")
     from rse_pf.extensions.rosbridge.server import serve_rosbridge
 
     url = request.url or f"ws://127.0.0.1:{settings.serving.port}{ROBOTS_PATH}"

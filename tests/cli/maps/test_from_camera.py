@@ -286,7 +286,7 @@ def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.Capt
         (["v.avi", "--intrinsics", "i.json", "--scale", "marker:big"], "--scale marker:big is unknown"),
         (["v.avi", "--intrinsics", "i.json", "--scale", "marker:99999"], "not within 5..5000 mm"),
         (["v.avi", "--intrinsics", "i.json", "--scale", "odometry:none.txt"], "cannot read none.txt"),
-        (["v.avi", "--intrinsics", "i.json", "--rate", "0"], "rate 0 is not above 0"),
+        (["v.avi", "--intrinsics", "i.json", "--rate", "0"], "rate 0 is not a finite number above 0"),
         (["v.avi", "--intrinsics", "i.json", "--frames", "1"], "--frames 1 is below 2"),
         (["v.avi", "--intrinsics", "i.json", "--url", "ws://p/ws"], "need each other"),
         (["v.avi", "--url", "p", "--token-file", "token"], "is not a WebSocket address"),

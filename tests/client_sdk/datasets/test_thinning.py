@@ -77,5 +77,5 @@ def test_a_camera_at_the_own_rate_loses_no_frame_of_a_tenth_of_jitter() -> None:
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
-    with pytest.raises(UsageError, match="not above 0"):
+    with pytest.raises(UsageError, match="not a finite number above 0"):
         Thinning(rate_hz)

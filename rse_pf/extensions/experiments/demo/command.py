@@ -109,7 +109,9 @@ def demo(request: DemoRequest, settings: PlatformSettings) -> int:
             hint="5 is the paper's; most recordings have 30",
         )
     if request.frames is not None and not 2 <= request.frames <= 2000:
-        raise UsageError(f"--frames {request.frames} is not within 2..2000", hint="80 is a path of 5.5 m")
+        raise UsageError(
+            f"--frames {request.frames} is not within 2..2000", hint="80 frames are a path of 5.5 m"
+        )
     if request.frames is not None and request.data is not None:
         raise UsageError(
             "--frames is for the rendered world: a recording is played whole",

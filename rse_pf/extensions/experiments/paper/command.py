@@ -130,7 +130,7 @@ def _check(request: ExperimentRequest) -> None:
         ("--seconds", request.seconds, 1, 3600, "30 is enough for percentiles"),
         ("--emulated-cores", request.emulated_cores, 0.001, 64, "leave it out to measure it"),
         ("--repeat", request.repeat, 1, 20, "3 shows the spread"),
-        ("--frames", request.frames, 2, 2000, "80 is a path of 5.5 m"),
+        ("--frames", request.frames, 2, 2000, "80 frames are a path of 5.5 m"),
     )
     for name, value, low, high, hint in limits:
         if value is not None and not (math.isfinite(value) and low <= value <= high):
