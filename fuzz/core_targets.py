@@ -184,7 +184,8 @@ def _refine_hostile_sizes(inliers: Anything, points: Array) -> None:
 def describe(data: bytes, meter: Meter) -> None:
     """Check that any picture and keypoints give descriptors or None, and no write beyond a buffer.
 
-    Keypoints that are detected in the picture lie within it.
+    A refusal (ProtocolError) gives None, and a second call must give the same.  Keypoints that are detected
+    in the picture lie within it.  *meter* measures the first call.
     """
     if len(data) < _HEAD:
         return

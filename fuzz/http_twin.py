@@ -90,7 +90,10 @@ def mutated(source: random.Random) -> bytes:
 
 
 async def requests_served(pieces: list[bytes]) -> list[Request]:
-    """Return the requests that reach the application behind the protocol, from one connection."""
+    """Return the requests that our HTTP protocol passes to its application, from one connection.
+
+    *pieces* are received one after another.  Malformed requests are not among those returned.
+    """
     served: list[Request] = []
 
     async def application(scope: Any, receive: Any, send: Any) -> None:

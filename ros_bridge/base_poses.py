@@ -212,7 +212,10 @@ class BasePoses:
 
 
 def _rotated(covariance: Array, T_new_old: Array) -> Array:
-    """Return a covariance ``(6, 6)`` of position and rotation about the axes of another frame."""
+    """Return a covariance ``(6, 6)`` of position and rotation, m and rad, about the axes of the new frame.
+
+    Only the rotation of ``T_new_old`` is used.
+    """
     rotation = np.zeros((6, 6))
     rotation[:3, :3] = rotation[3:, 3:] = T_new_old[:3, :3]
     rotated: Array = rotation @ covariance @ rotation.T

@@ -349,7 +349,11 @@ class Bridge:
             self._publish(message)
 
     def _publish_map(self, mapper: Mapper | LiveMapper, stamp_ns: int) -> None:
-        """Publish what is due of path, cloud and floor plan, once the world has a pose in the map."""
+        """Start to publish those of path, cloud and floor plan whose interval has passed.
+
+        Nothing is published before the pose of the mapper's world in the map is known.  *stamp_ns* is the
+        stamp of cloud and floor plan: the time of the newest frame.
+        """
         T_map_world, options = self._T_map_world, self._options
         if T_map_world is None:
             return

@@ -223,10 +223,10 @@ class IncomingFrames:
             return self._ready.popleft() if self._ready and not self._waits_for_imu() else None
 
     def decode(self, images: PairedImages, *, keeps_repeated: bool = False) -> Frame | None:
-        """Decode *images* and return the undistorted frame; None if they cannot be used, which is counted.
+        """Decode *images* and return the undistorted frame; None if they cannot be used.
 
-        With *keeps_repeated*, an image that repeats the one before is reported but used: the mapper of a
-        robot with wheels knows what to do with it.
+        ``check`` counts the frames that are left out and reports why.  An image that repeats the one before
+        is left out; with *keeps_repeated* it is reported but used, for a mapper with wheel odometry.
         An image of a camera_info other than the first one is mapped to the camera of the first one.
         """
         try:
@@ -308,7 +308,9 @@ class IncomingFrames:
         return True
 
     def _find_repeated(self, images: PairedImages) -> str:
-        """Return a sentence if an image has the bytes of the previous one: its camera is frozen.
+        """Return a sentence if an image has the bytes of its topic's previous one: the camera is frozen.
+
+        Otherwise the text is empty.
 
         The noise of a working camera changes the bytes even if the camera is stationary.  Depth images, and
         images with a single brightness, are not checked, since they may be the same for a moving camera.

@@ -78,7 +78,11 @@ def train_words(views: list[Descriptors]) -> npt.NDArray[np.float32]:
 def directions_of(
     views: list[Descriptors], words: npt.NDArray[np.float32], count: int
 ) -> npt.NDArray[np.float64]:
-    """Return the ``(256, count)`` principal directions of descriptors around their nearest word."""
+    """Return the ``(256, count)`` principal directions of descriptors around their nearest word.
+
+    These are unit vectors along which the bits (-1, 1) differ most from the nearest word, the largest
+    differences first.  The mean of the differences is not subtracted.
+    """
     scatter = np.zeros((words.shape[1], words.shape[1]))
     for view in views:
         bits = np.unpackbits(view, axis=1) * 2.0 - 1.0

@@ -57,7 +57,7 @@ _PARALLEL = ("vectors", "pairs", "links", "agree", "tiles")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """The arguments."""
+    """The arguments: *copies* maps are merged, with *candidates* as in `MergeOptions`."""
 
     recordings: Recordings = Path("../shared/data")
     copies: int = 4

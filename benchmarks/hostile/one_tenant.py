@@ -187,7 +187,10 @@ Neighbour = Callable[[Robot, "_Place"], Awaitable[None]]
 
 
 class _Place:
-    """The platform and the token of a neighbour, and the number of its requests by result code."""
+    """The platform's address and the token of a neighbour: a robot of another tenant, fair or hostile.
+
+    ``codes`` counts the neighbour's requests by service and result, such as ``pnp ok`` or ``PUT 201``.
+    """
 
     def __init__(self, url: str, token: str) -> None:
         self.url, self.token = url, token

@@ -54,7 +54,11 @@ _ARRAYS = ("pixels", "descriptors", "points_camera", "orientations", "sizes", "d
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """The arguments."""
+    """The arguments: ``prepare`` writes the folder *features*, and ``run`` reads it.
+
+    *robots* to *processes* are for ``prepare``; *frames* are those of each robot.  *rounds* and *folder* are
+    for ``run``.
+    """
 
     part: Literal["prepare", "run"]
     features: Path = Path("out-live-features")
@@ -67,7 +71,10 @@ class Options:
 
 
 def prepare(folder: Path, robots: int, rooms: int, frames: int, processes: int = 2) -> None:
-    """Render the drives, and write the features of each robot's frames unless their file exists."""
+    """Render the drive of each robot, of *frames* frames, and write the features of its frames.
+
+    A robot whose file exists is left out, whatever numbers it was made for: use a new *folder* for others.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     orders = [
         (folder, robot, robots, rooms, frames)

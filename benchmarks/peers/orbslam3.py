@@ -93,7 +93,7 @@ _FEATURES_OF_KITTI = 2000  # number of ORB features of an image of KITTI, as in 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """The arguments."""
+    """The arguments: *runs* is the number of runs of each row of the comparison."""
 
     python: Annotated[Path, "of the environment of the peer"]
     vocabulary: Path

@@ -141,9 +141,10 @@ class RobotGroup:
 class LoadPlan:
     """One run of the generator against one port of loopback.
 
-    *codec* is ``zlib``, ``json``, ``bin``, or ``peer`` for the paper's design, which has no sub-protocol.
-    The window begins *warm_up_s* after the last robot has connected, and unanswered messages are lost
-    *drain_s* after its end.  Connections come from *sources* addresses, in turn.
+    *codec* is ``zlib``, ``json``, ``bin``, or ``peer`` for the paper's design, which has no sub-protocol of
+    WebSocket.  The window begins *warm_up_s* after the last robot has connected, and lasts *seconds*.
+    Messages that are planned within it count; those without an answer *drain_s* after its end are lost.
+    *sources* is the number of addresses from which connections come, in turn.
     """
 
     port: int

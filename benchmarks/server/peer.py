@@ -68,7 +68,7 @@ _MODULE = Path("/usr/lib/nginx/modules/ngx_http_lua_module.so")
 _HEADERS = Path("/usr/include/opencv4")
 _START_S = 10.0  # time limit for the start and for the exit of nginx
 _COMPILE_S = 120.0  # time limit for compiling the paper's design
-_DRAIN_S = 1.5  # time after a run in which answers still count
+_DRAIN_S = 1.5  # time after the window of a run, seconds; messages without an answer until then are lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

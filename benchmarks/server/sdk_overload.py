@@ -193,7 +193,11 @@ def codec_of(connection: ServerConnection) -> Any:
 
 
 async def python_robots(url: str, drive: Drive) -> list[dict[str, Any]]:
-    """Let robots of the Python SDK send; return their statistics."""
+    """Let `ROBOTS` robots of the Python SDK send the commands of *drive* for `SECONDS`.
+
+    Return for each robot the number of its commands that were ``held_back``, by reason, and of its
+    ``reconnects``.
+    """
     robots = [await connect(url, codec="bin") for _ in range(ROBOTS)]
     began = time.monotonic()
     for turn in range(round(SECONDS * drive.frames_per_s)):
@@ -210,7 +214,7 @@ async def python_robots(url: str, drive: Drive) -> list[dict[str, Any]]:
 
 
 async def other_robots(program: list[str], url: str, drive: Drive) -> list[dict[str, Any]]:
-    """Let the robots of a *program* send; return their statistics."""
+    """Let the robots of a *program* send the same; return the same as `python_robots`."""
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         json.dump({"service": drive.service, "payload": drive.payload}, file)
         file.flush()

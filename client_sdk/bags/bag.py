@@ -74,7 +74,7 @@ _MAX_VIEW_DIFFERENCE = 0.01
 _MAX_CHECKED_CHANGES = 5
 # The images before and after a change of the calibration in ``CameraInfo`` contradict the change if their
 # error (`mismatch_px`) with the change exceeds that without it by more than this, px, and by more than the
-# factor `_MIN_MISMATCH_RATIO`.
+# factor `_MIN_MISMATCH_RATIO`; the bag is then refused.
 _MIN_MISMATCH_PX = 3.0
 # Ratio of the error with the change of the calibration to that without it above which images contradict the
 # change, if `_MIN_MISMATCH_PX` is exceeded as well.
@@ -128,7 +128,9 @@ class BagOptions:
     def __post_init__(self) -> None:
         for name, value in (("depth_scale", self.depth_scale), ("pair_within_s", self.pair_within_s)):
             if value is not None and not (math.isfinite(value) and value > 0):
-                raise UsageError(f"{name} = {value:g} is not above 0", hint="leave it out for the default")
+                raise UsageError(
+                    f"{name} = {value:g} is not a finite number above 0", hint="leave it out for the default"
+                )
 
 
 @dataclass(slots=True, eq=False)
@@ -377,7 +379,10 @@ def _stated_by(chosen: ChosenTopics, options: BagOptions) -> str:
 
 
 def _change_doubts(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> tuple[Doubt, ...]:
-    """Return a doubt if the bag states several calibrations of the colour camera; empty for one."""
+    """Return a doubt if the bag states several calibrations of the colour camera; otherwise empty.
+
+    *lenses* are these calibrations, and *lens* is the one to whose camera all images are resampled.
+    """
     if len(lenses) < 2 or chosen.colour_info is None:
         return ()
     focal = ", ".join(f"{each.camera.fx:g}" for each in lenses)

@@ -39,7 +39,10 @@ _charged = Allowance(0)  # the allowance from which decompressed bytes are subtr
 
 
 def charge(allowance: Allowance) -> None:
-    """Subtract all bytes that are decompressed from now on in this process from *allowance*."""
+    """Subtract the size of all decompressed data in this process from *allowance* from now on.
+
+    It replaces the previous allowance.  Decompression raises ValueError once *allowance* is used up.
+    """
     global _charged
     _charged = allowance
 

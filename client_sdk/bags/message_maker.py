@@ -58,7 +58,7 @@ class MessageMaker:
         """Decode a message of the type *kind*; its arrays may be views of *data*.
 
         Raises:
-            BrokenMessage: The bytes are not a message of this type.
+            BrokenMessage: The bytes are not a message of this type, or there is no such type.
         """
         from rosbags.serde import SerdeError
         from rosbags.typesys import TypesysError

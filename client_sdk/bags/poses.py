@@ -49,8 +49,8 @@ class _Edge:
     def at(self, stamp_ns: int) -> Array | None:
         """Return ``T_parent_child`` at a time, interpolated between the transforms before and after it.
 
-        The result is None without transforms, before the first and after the last transform, and if the
-        transforms before and after are more than 0.2 s apart.
+        A static transform holds at all times.  Others are known at their own time stamps, and between two
+        that are at most 0.2 s apart.  The result is None at other times, or without transforms.
         """
         if not self.stamps_ns:
             return None
@@ -101,7 +101,11 @@ class TransformTree:
         return frame, moves
 
     def pose(self, frame: str, stamp_ns: int) -> Array | None:
-        """Return ``T_root_frame`` at a time; None if a transform is missing then."""
+        """Return ``T_root_frame`` at a time, with the topmost frame of the tree of *frame* as the root.
+
+        The result is None if a transform on the way is not known at that time.  A frame without a parent,
+        also one that tf does not have, is its own root: the result is the identity.
+        """
         T = np.eye(4)
         frame = frame.strip("/")
         for _ in range(_MAX_TRANSFORMS_TO_ROOT):

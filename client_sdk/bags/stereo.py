@@ -19,7 +19,9 @@ _HINT = "give both cameras yourself: --intrinsics rig.json; or take one: --no-de
 _MAX_COEFFICIENTS = 5
 """Largest number of distortion coefficients other than 0 of a camera in a stereo pair."""
 
-_MAX_BASELINE_M = 10.0  # largest distance, metres, between both cameras; a larger one is in a wrong unit
+# Largest distance, metres, between the cameras of a stereo pair; a larger one is refused, since its unit is
+# probably wrong.
+_MAX_BASELINE_M = 10.0
 
 CameraMessage = tuple[str, Any, bool]
 """A camera of a bag: the name of its ``CameraInfo`` topic, the message, and whether its images are rectified

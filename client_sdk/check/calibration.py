@@ -240,7 +240,10 @@ def _adjust_drive(
 
 
 def _depth_error_factor(adjusted: Calibrated) -> float:
-    """Return the ratio of the depth noise of the drive to that of a Kinect, at least 1."""
+    """Return the factor on `_MODEL_DEVIATIONS`: depth noise of the drive over that of a Kinect, at least 1.
+
+    Noise is the standard deviation of the depths as a multiple of the stated one; without depths it is 1.
+    """
     return max(1.0, adjusted.depth_factor / _KINECT_DEPTH_FACTOR)
 
 

@@ -177,8 +177,8 @@ def matters(cost_m: float, noise_m: float) -> bool:
     """Return whether a fault bends a path by more than 2 mm and more than 1.2 times the path's uncertainty.
 
     Args:
-        cost_m: How far the fault bends the path, metres.
-        noise_m: Uncertainty of the path, root mean square, metres.
+        cost_m: How far the fault moves the positions of the path after alignment, root mean square, metres.
+        noise_m: Uncertainty of the positions of the path, root mean square, metres.
     """
     return cost_m > max(_MIN_COST_M, _MIN_COST_NOISES * noise_m)
 

@@ -64,7 +64,8 @@ motions' sum of squares."""
 _MIN_AXES_ANGLE_DEG = 20.0  # smallest rotation between the axes of reference and camera that is a fault
 # Largest rotation, degrees, between the estimated axes and an exact exchange of axes that a message names.
 _MAX_NAMED_AXES_ERROR_DEG = 15.0
-# Distance, metres, that the reference moves in each part of a path whose scale is compared.
+# Smallest straight distance, metres, between the ends of a part of the reference's path; the scale is
+# computed from such parts, which may overlap.
 _SCALE_PART_M = 0.25
 # Longest duration, seconds, of a part of a path whose scale is compared: drift bounds it.
 _MAX_SCALE_PART_S = 6.0
@@ -618,8 +619,9 @@ def _solve_scale(A: Array, B: Array, rotation: Array, arm_m: float, kept: Array)
     """Return the scale: metres of the reference per metre of the camera; and the residuals ``(m,)``, metres.
 
     Solves ``(R_A - I) t + t_A = s R t_B`` for the scale ``s`` and for the position ``t`` of the camera in the
-    frame of the reference, which a prior keeps at about *arm_m*.  *A* and *B* ``(m, 4, 4)`` are the motions
-    of reference and camera; only the equations of the rows that are *kept* are solved.
+    frame of the reference.  ``R`` is the inverse of *rotation*, which is ``R_camera_reference``.  A prior on
+    ``t`` has the mean 0 and the standard deviation *arm_m*.  *A* and *B* ``(m, 4, 4)`` are the motions of
+    reference and camera, and *kept* ``(m,)`` says whose equations are solved; residuals are those of all.
     """
     R_reference_camera = rotation.T
     moved = B[:, :3, 3] @ R_reference_camera.T

@@ -21,7 +21,9 @@ __all__ = ["ZoomCheck", "check_zooms"]
 
 _MIN_JUMP = 0.03  # smallest difference of two successive zooms that is a jump
 _MIN_CHANGE = 0.02  # smallest change of the zoom over a drive that is reported
-_CERTAIN_SIGMAS = 3.0  # a change of the zoom is certain if it exceeds this many standard deviations
+# A change of the zoom, the logarithm of the focal length, is a finding only if it exceeds this many of its
+# standard deviations.
+_CERTAIN_SIGMAS = 3.0
 _JUMP_SIGMAS = 6.0  # a jump of the zoom exceeds this many standard deviations of its step
 _HINT_SIGMAS = 1.5  # a change of the zoom of more than this many standard deviations is returned as a hint
 # Largest difference of a jump from the mean jump between two cameras, as a share of the mean jump.

@@ -260,7 +260,11 @@ class LocalCluster:
 
 
 class DaskEngine:
-    """Computes parts by the workers of a cluster, and restarts the cluster's scheduler if it is lost."""
+    """Computes the parts of a batch job by the workers of a cluster.
+
+    If the scheduler is lost, the cluster is started again, at most three times, and the parts whose results
+    are not in the store are computed again.  A `RemoteCluster` is not started, but must answer again.
+    """
 
     def __init__(
         self,

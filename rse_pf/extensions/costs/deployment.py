@@ -25,7 +25,7 @@ class DeploymentCosts:
         return f"{bill.total / HOURS:.2f} {money} an hour, {bill.total:.0f} {money} a month"
 
     def warnings(self, settings: PlatformSettings) -> list[str]:
-        """Return the warnings about the prices, for example that they are old or of another region."""
+        """Return warnings of prices that are over a year old or of another region; empty if neither."""
         today = datetime.now(timezone.utc).date()
         return self.prices.warnings(today=today, region=settings.cloud.region)
 

@@ -134,7 +134,8 @@ class FleetApp:
             self._check_origin(request)
             await self._answer(request, receive, send)
         except RsePfError as error:
-            # Sending fails with one of these exceptions if a part of the answer was sent already.
+            # A part of another answer may have been sent already (RuntimeError), or the client may have left
+            # (OSError): then nobody can receive the error.
             with contextlib.suppress(OSError, RuntimeError):
                 await _send(send, _STATUS.get(error.code, 400), _error_document(error))
 

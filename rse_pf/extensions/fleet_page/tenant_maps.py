@@ -17,8 +17,8 @@ from rse_pf.storage.object_store import ObjectStore
 
 __all__ = ["map_label", "platform_store", "split_label", "tenants_with"]
 
-# Largest number of tenants whose maps are shown, besides the default one: each needs a connection of the
-# page.
+# Largest number of tenants whose maps are shown besides the default one, the first by name: the page's
+# server opens a connection to the platform for each.
 _MAX_TENANTS = 32
 
 

@@ -118,7 +118,10 @@ class RecordedCommand:
 
     @property
     def round_trip_ms(self) -> float | None:
-        """Time from command to answer on the recording side, ms; None without an answer."""
+        """Time between the recording of the command and of its answer, ms; None without an answer.
+
+        In a recording of a robot it includes the network; in one of a server only the work of the server.
+        """
         return None if self.answered_ns is None else (self.answered_ns - self.sent_ns) / 1e6
 
     @cached_property

@@ -20,7 +20,10 @@ __all__ = ["TopicClient", "Topics"]
 MAX_TOPICS = 64
 """Largest number of topics that one client advertises."""
 MAX_SUBSCRIPTIONS = 64
-"""Largest number of subscriptions of one client, counted by their ids."""
+"""Largest number of subscriptions of one client; further ones are refused.
+
+Each id of a topic counts as one, and so do all subscriptions of a topic that have no id.
+"""
 MAX_TOPICS_OF_TENANT = 1000
 """Largest number of topics of one tenant."""
 MAX_LATCHED_BYTES = 4 << 20

@@ -52,7 +52,7 @@ class MeteredSolver(Protocol):
 class InProcessSolver:
     """Answers the pose queries of one run by the PnP service, in this process and deterministically.
 
-    Every run needs a new solver, because the bytes of a command depend on its number.
+    Every run needs a new solver: commands are numbered from 1, and a longer number would add to `sent_bytes`.
     """
 
     def __init__(self, settings: PlatformSettings) -> None:

@@ -339,8 +339,8 @@ def _write_results(
     for path, (points, colours), robot in zip(paths, clouds, finished, strict=True):
         caption = f"{path.name}: {robot.frames} frames, {robot.lost_frames} lost, {len(points):,} points"
         draw_map(folder / path.name / "map.png", points, colours, [path], caption)
-    # With --merge or --live each robot starts in a world frame of its own: their clouds cannot be drawn
-    # together.
+    # With --merge or --live each robot starts in a world frame of its own, and its cloud stays in that frame:
+    # there is no picture of all clouds.
     in_one_frame = not options.merge and not options.live
     if len(paths) > 1 and in_one_frame and all(robot.truth is not None for robot in finished):
         points = np.concatenate([points for points, _ in clouds])

@@ -56,7 +56,7 @@ __all__ = [
     "time_until_even_s",
 ]
 
-# Name of the file with the image of this experiment.
+# Name of the file, in the folder ``out``, with the image of the robustness experiment.
 FIGURE = "robustness.png"
 # Seconds under load before the fault.
 _BEFORE_FAULT_S = 4.0

@@ -235,9 +235,10 @@ def _servers(axis: Any, records: Records, parameters: Mapping[str, Any]) -> None
 
 
 def _round_trips(axis: Any, records: Records) -> None:
-    """Draw p50 and p99 of the round trips per bin of planned send time, and failures as bars.
+    """Draw p50 and p99 of the round trips, ms, per bin of planned send time, and failures as bars.
 
-    A third line is the largest median of a single robot in each bin.
+    A third line is the largest median of a single robot in each bin.  The bars count answers with an error;
+    commands without an answer are not drawn.
     """
     done = [
         command for command in records.commands if command.code == "ok" and command.round_trip_ms is not None

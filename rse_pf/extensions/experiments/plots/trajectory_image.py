@@ -45,7 +45,7 @@ _MAX_PANELS = 24
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnPath:
-    """An estimated path with its name in the legend."""
+    """An estimated path, in the frame and unit of its panel, with its name in the legend."""
 
     name: str
     path: Trajectory

@@ -27,7 +27,7 @@ def is_met(value: Any, sense: str, limit: float) -> bool:
 
 
 def missed_bars(figures: Mapping[str, Any]) -> list[str]:
-    """Return the names of the figures of a run that missed their targets."""
+    """Return the paths of the figures that miss their targets, by the member ``bars`` of `with_bars`."""
     return [name for name, bar in figures["bars"].items() if not bar["held"]]
 
 

@@ -145,9 +145,11 @@ _TABLE_HEAD = (
 def _keyframes(drives: Sequence[LiveDrive], logged: LoggedMap) -> dict[str, int]:
     """Return counts of keyframes, by comparing the robots' records with the log of the map.
 
-    ``waiting`` counts keyframes that were never acknowledged, ``lost`` the acknowledged ones that the log
-    lacks, ``twice`` the numbers and time stamps that occur more than once, and ``out_of_order`` those of a
-    robot that follow a later one.
+    ``made``, ``acknowledged`` and ``waiting`` (never acknowledged) are counted by the robots, ``in_log`` in
+    the log.  ``lost`` counts acknowledged keyframes that the log lacks.  ``twice`` is the sum of three counts
+    of repetitions within a robot: of numbers in the log, of time stamps in the log, and of numbers among the
+    acknowledged keyframes.  ``out_of_order`` counts keyframes whose number and time stamp are not after
+    those of the robot's previous keyframe in the log.
     """
     lost = twice = out_of_order = 0
     for drive in drives:

@@ -35,9 +35,10 @@ T = TypeVar("T")
 
 
 class _Task(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A call of one function of `run` in the process with limits.
+    """A call of one function of the module `run` in a process with limits of memory, time and reply.
 
-    ``do`` is ``overview``, ``report`` or ``find``; the other fields are arguments of these functions.
+    ``do`` names the function: ``overview``, ``report`` or ``find``.  The other fields are arguments, of which
+    each function uses those that it has.
     """
 
     do: str
@@ -54,7 +55,7 @@ class _Task(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class LimitedReplay:
-    """Call the functions of `run` in a process with limits, which the first call starts."""
+    """Call the functions of the module `run` in a process with limits, which the first call starts."""
 
     def __init__(self, settings: PlatformSettings | None = None) -> None:
         """Prepare the process; *settings* hold the limits of messages, None for the defaults."""
