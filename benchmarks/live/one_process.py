@@ -293,7 +293,11 @@ def kitchen(recordings: Path, runs: int) -> dict[str, Any]:
 
 
 def foreign(recordings: Path, runs: int) -> dict[str, Any]:
-    """Return how many robots of unrelated recordings join each other."""
+    """Return how many robots of four unrelated recordings are joined wrongly, the sum of all *runs*.
+
+    The runs differ in the order and the starting times of the robots.  ``open_links`` is the sum of the loop
+    closures that are neither accepted nor rejected at the end.
+    """
     drives: dict[str, Run] = {}
     for name in FOREIGN:
         dataset: Dataset = open_dataset(recordings / name)

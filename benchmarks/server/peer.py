@@ -176,7 +176,10 @@ def _listens(port: int) -> bool:
 def measure(
     server: MeasuredServer, outliers: float, robots: int, seconds: float, seed: int
 ) -> dict[str, Any]:
-    """Return the figures of one run."""
+    """Return the figures of one run of *seconds*, with this share of wrong matches: *outliers*.
+
+    A single robot sends after each answer; several send `FRAMES_PER_S` each.
+    """
     cpu: dict[str, float] = {}
     group = RobotGroup(
         name="robots", robots=robots, mode="closed" if robots == 1 else "open",
