@@ -9,7 +9,6 @@ import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rse_pf.command_line.packages import Defect, find_defect, find_misuse
 from rse_pf.errors import ConfigurationError, MissingExtra
 
 __all__ = ["EXTRAS", "VERBS_NEED", "Extra", "error_of_module", "is_installed", "modules_of", "require"]
@@ -166,7 +165,12 @@ def require(verb: str) -> None:
         for module, package in modules.items():
             if importlib.util.find_spec(module) is None:
                 raise MissingExtra(package, extra)
-        if "cv2" in modules and find_misuse("cv2", modules["cv2"]) is not None:
+        if "cv2" not in modules:
+            continue
+        # Imported here, as it loads importlib.metadata, which most verbs do not need.
+        from rse_pf.command_line.packages import Defect, find_defect, find_misuse
+
+        if find_misuse("cv2", modules["cv2"]) is not None:
             defect = find_defect("cv2", modules["cv2"]) or Defect(problem="cv2 does not work")
             raise ConfigurationError(defect.problem, hint=defect.fix)
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ast
 import importlib
 import json
@@ -86,17 +85,20 @@ def half_a_complaint(command: str) -> str:
         return ""
     if verb not in VERBS:
         return "no verb"
-    parser = parser_of(verb)
-    if parser.default_action and words[:1] and words[0].startswith("-"):
-        words = [parser.default_action, *words]
-    actions = parser._actions
-    known = {option for action in actions for option in action.option_strings}
-    choices = next((each.choices for each in actions if not each.option_strings and each.choices), None)
-    subparsers = [each.choices for each in actions if isinstance(each, argparse._SubParsersAction)]
-    if subparsers and words and words[0] in subparsers[0]:
-        known |= {name for action in subparsers[0][words[0]]._actions for name in action.option_strings}
-    if choices is not None and words and not words[0].startswith("-") and words[0] not in choices:
-        return f"{words[0]} is none of {', '.join(map(str, choices))}"
+    parser, known = parser_of(verb), set[str]()
+    while True:
+        if parser.default_action and words[:1] and words[0].startswith("-"):
+            words = [parser.default_action, *words]
+        known |= {option for action in parser._actions for option in action.option_strings}
+        positional = [each.choices for each in parser._actions if not each.option_strings and each.choices]
+        if not positional or not words or words[0].startswith("-"):
+            break
+        choices = positional[0]
+        if words[0] not in choices:
+            return f"{words[0]} is none of {', '.join(map(str, choices))}"
+        if not isinstance(choices, dict):
+            break
+        parser, words = choices[words[0]], words[1:]
     return " ".join(word for word in words if word.startswith("--") and word.partition("=")[0] not in known)
 
 
