@@ -56,6 +56,15 @@ def export(name: str, kind: str, out: str, *words: str) -> int:
     return main(["map", "export", name, "--format", kind, "--out", out, "--store", "dir:store", *words])
 
 
+@pytest.mark.parametrize(
+    ("kind", "begins"), [("ply", b"ply"), ("pcd", b"# .PCD"), ("tum", b"#"), ("g2o", b"VERTEX")]
+)
+def test_a_format_of_one_file_is_written(folder: Path, kind: str, begins: bytes) -> None:
+    assert export("hall", kind, f"hall.{kind}") == 0
+
+    assert (folder / f"hall.{kind}").read_bytes().startswith(begins)
+
+
 @pytest.mark.parametrize("kind", WRITTEN)
 def test_a_format_of_several_files_is_a_folder(
     folder: Path, kind: str, capsys: pytest.CaptureFixture[str]

@@ -76,17 +76,6 @@ def test_prune_removes_old_versions_and_says_how_many_bytes_are_free(
     assert asked(capsys, store, "prune", "hall", "--keep", "1") == {"freed_bytes": 0, "removed": []}
 
 
-@pytest.mark.parametrize(
-    ("kind", "begins"), [("ply", b"ply"), ("pcd", b"# .PCD"), ("tum", b"#"), ("g2o", b"VERTEX")]
-)
-def test_export_writes_the_file(store: Path, kind: str, begins: bytes) -> None:
-    out = store.parent / f"hall.{kind}"
-
-    assert run(store, "export", "hall", "--format", kind, "--out", str(out)) == 0
-
-    assert out.read_bytes().startswith(begins)
-
-
 def test_a_store_in_memory_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "list", "--store", "memory:"]) == 2
     assert "dir:PATH" in capsys.readouterr().err
