@@ -15,9 +15,9 @@ import numpy as np
 
 from client_sdk.frontend import TrackedFrame
 from ros_bridge.robot_frames import RobotFrames
-from rse_pf.geometry import Array, exp_se3, inverse, log_se3, skew
+from rse_pf.geometry import Array, exp_se3, inverse, log_se3, planar_pose, skew
 
-__all__ = ["BasePose", "BasePoses", "planar_pose", "with_alignment"]
+__all__ = ["BasePose", "BasePoses", "project_to_plane", "with_alignment"]
 
 # Covariance (6, 6) of a pose without one: so large that filters give the pose no weight.
 _UNKNOWN = np.diag(np.full(6, 1e6))
@@ -47,13 +47,9 @@ class BasePose:
     odom_covariance: Array
 
 
-def planar_pose(T: Array) -> Array:
+def project_to_plane(T: Array) -> Array:
     """Return the pose ``(4, 4)`` in the plane z = 0 with x, y and yaw of *T*."""
-    yaw = math.atan2(T[1, 0], T[0, 0])
-    pose: Array = np.eye(4)
-    pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    pose[:2, 3] = T[:2, 3]
-    return pose
+    return planar_pose(T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))
 
 
 def with_alignment(covariance: Array, T_map_base: Array, alignment: Array) -> Array:
@@ -186,8 +182,8 @@ class BasePoses:
             if covariance is not None:
                 odom_covariance = _rotated(covariance, T_odom_world)
         if self._frames.is_planar:
-            T_map_base = None if T_map_base is None else planar_pose(T_map_base)
-            T_odom_base = None if T_odom_base is None else planar_pose(T_odom_base)
+            T_map_base = None if T_map_base is None else project_to_plane(T_map_base)
+            T_odom_base = None if T_odom_base is None else project_to_plane(T_odom_base)
             map_covariance, odom_covariance = _planar(map_covariance), _planar(odom_covariance)
         return BasePose(
             T_world_base=T_world_base, T_map_base=T_map_base, map_covariance=map_covariance,

@@ -20,7 +20,7 @@ from client_sdk.bags.message_types import (
     STRING,
     TF,
 )
-from ros_bridge.base_poses import BasePose, planar_pose
+from ros_bridge.base_poses import BasePose, project_to_plane
 from ros_bridge.frame_tree import Transform
 from ros_bridge.options import BridgeOptions
 from ros_bridge.robot_frames import RobotFrames
@@ -113,7 +113,7 @@ class OutgoingMessages:
             self._made_for, self._made_path = (path, T_map_world), []
         for stamp_ns, T_world_base in poses[len(self._made_path) :]:
             pose = T_map_world @ T_world_base
-            pose = planar_pose(pose) if self._frames.is_planar else pose
+            pose = project_to_plane(pose) if self._frames.is_planar else pose
             self._made_path.append(self._maker.pose(stamp_ns, self._frames.map, pose))
         made = self._maker.path_of(poses[-1][0], self._frames.map, self._made_path)
         return [self._message("rse_pf/path", PATH, made)]

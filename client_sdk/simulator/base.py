@@ -18,7 +18,7 @@ from client_sdk.simulator.building import Building
 from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, planar_pose
 
 __all__ = [
     "BASE_CAMERA",
@@ -111,7 +111,7 @@ class DifferentialBase:
     @property
     def T_building_base(self) -> Array:
         """Exact pose ``(4, 4)`` in the building, metres."""
-        return _planar_pose(self.x_m, self.y_m, self.yaw_rad)
+        return planar_pose(self.x_m, self.y_m, self.yaw_rad)
 
     def step(self, speed_m_s: float, turn_rate_rad_s: float) -> tuple[float, float]:
         """Drive for `STEP_S` towards a forward speed and a turn rate (positive to the left).
@@ -168,7 +168,7 @@ class SlippingWheels:
                 self._x_m, self._y_m, self._yaw_rad, way_m, angle_rad
             )
         late_s = _LATE_LIE_S if lie == "late" else 0.0
-        return stamp_s + late_s, _planar_pose(self._x_m, self._y_m, self._yaw_rad)
+        return stamp_s + late_s, planar_pose(self._x_m, self._y_m, self._yaw_rad)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -284,14 +284,6 @@ def _moved(
         y_m + chord_m * math.sin(middle_rad),
         yaw_rad + angle_rad,
     )
-
-
-def _planar_pose(x_m: float, y_m: float, yaw_rad: float) -> Array:
-    pose = np.eye(4)
-    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
-    pose[:2, :2] = [[cosine, -sine], [sine, cosine]]
-    pose[:2, 3] = [x_m, y_m]
-    return pose
 
 
 def _towards(value: float, wanted: float, acceleration: float) -> float:

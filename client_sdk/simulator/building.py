@@ -100,8 +100,10 @@ BUILDINGS = tuple(_PLANS)
 """Names of the buildings."""
 
 _WALL = "#"
-_SHELF, _SHELF_HEIGHT_M = "S", 1.9
-_BOX, _BOX_HEIGHT_M = "B", 0.8
+_SHELF = "S"
+_SHELF_HEIGHT_M = 1.9  # height of a shelf, metres: above the camera
+_BOX = "B"
+_BOX_HEIGHT_M = 0.8  # height of a box, metres: the camera sees over it
 _FLOOR_TEXEL_M = 0.0055
 """Width of a texel of floors, whose textures repeat after 5.6 m; most rooms are at most that long, because a
 floor that repeats in view gives false places."""

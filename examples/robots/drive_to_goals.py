@@ -39,12 +39,16 @@ GRID_FRAMES = 8  # images from one floor plan to the next: 1.6 s
 GOAL_S = 150.0  # longest time for a goal
 CLEARANCE_M = RADIUS_M + 0.06  # distance that a path keeps from obstacles: the robot, and a cell for noise
 COMFORT_M = 0.45  # cells nearer to an obstacle than this cost more, so that paths keep to the middle
-NEAR_COST, UNKNOWN_COST, TIGHT_COST = 3.0, 2.0, 30.0  # cost of a cell; that of a free one is 1
+NEAR_COST = 3.0  # factor of the cost of a cell nearer to an obstacle than COMFORT_M; a free cell costs 1
+UNKNOWN_COST = 2.0  # cost of a cell that was not seen
+TIGHT_COST = 30.0  # cost of a cell nearer to an obstacle than CLEARANCE_M, where a path has no other way
 LOOK_AHEAD_M = 0.4  # the robot steers to the point of its path at this distance
-ARRIVED_M, ARRIVED_RAD = 0.04, 0.05  # the robot stops at this distance from a goal and its direction
+ARRIVED_M = 0.04  # the robot stops at this distance from a goal
+ARRIVED_RAD = 0.05  # the robot stops turning at this angle from the direction of a goal
 SLOW_M = 0.6  # nearer to a goal than this, the speed falls with the distance
 CREEP_M_S = 0.06  # slowest speed on the way to a goal
-REACHED_M, REACHED_DEG = 0.15, 10.0  # largest true errors of a goal that counts as reached
+REACHED_M = 0.15  # largest true distance from a goal that counts as reached
+REACHED_DEG = 10.0  # largest true error of the direction at a goal that counts as reached
 
 
 def plan(grid: OccupancyGrid, start: Array, goal: Array) -> Array | None:
@@ -252,8 +256,13 @@ async def main(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
+    given = parser.parse_args()
+    if given.goals < 1:
+        parser.error(f"--goals {given.goals} is not above 0: name how many goals there are")
+    if given.seed < 0:
+        parser.error(f"--seed {given.seed} is negative: name 0 or more")
     try:
-        asyncio.run(main(parser.parse_args()))
+        asyncio.run(main(given))
     except KeyboardInterrupt:
         pass
     except RsePfError as error:

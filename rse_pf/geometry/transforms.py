@@ -25,6 +25,7 @@ __all__ = [
     "log_so3",
     "median_pose",
     "orthonormalise",
+    "planar_pose",
     "pose_difference",
     "right_jacobian_so3",
     "rigid",
@@ -55,6 +56,15 @@ NEAR_HALF_TURN_COSINE = -0.999
 is for angles above 177.4 degrees: the antisymmetric part of the matrix, which it uses for smaller angles,
 vanishes at 180 degrees."""
 SMALL_ANGLE_RAD = 1e-4  # below this angle, series replace quotients whose denominators vanish
+
+
+def planar_pose(x_m: float, y_m: float, yaw_rad: float) -> Array:
+    """Return the pose ``(4, 4)`` of a robot in the plane z = 0, turned by *yaw_rad* about z."""
+    pose: Array = np.eye(4)
+    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+    pose[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    pose[:2, 3] = x_m, y_m
+    return pose
 
 
 def transform(T_a_b: Array, points_b: Array) -> Array:

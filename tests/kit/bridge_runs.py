@@ -169,7 +169,7 @@ def send_odometry(bridge: Bridge, stamp_ns: int, T: Array, frames: tuple[str, st
 
 
 def count_of(kind: str, count: int) -> Callable[[list[Message]], bool]:
-    """Return whether there are so many messages of a kind."""
+    """Return a function that returns whether *count* messages of a kind have come."""
     return lambda heard: sum(each.kind == kind for each in heard) >= count
 
 

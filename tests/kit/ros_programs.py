@@ -145,7 +145,7 @@ async def own_run(
 
 
 def poses(number: int, kind: str = "pose") -> Callable[[list[str]], bool]:
-    """Return whether a listener has written so many poses, or lines of another *kind*."""
+    """Return a function that returns whether a listener has written *number* poses, or lines of *kind*."""
     return lambda lines: sum(f'"kind": "{kind}"' in line for line in lines) >= number
 
 

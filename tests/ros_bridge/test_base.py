@@ -20,7 +20,7 @@ from client_sdk.bags.message_types import (
 )
 from client_sdk.frontend import Frame, TrackedFrame
 from ros_bridge import Bridge
-from ros_bridge.base_poses import planar_pose
+from ros_bridge.base_poses import project_to_plane
 from ros_bridge.outgoing import Message
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.slam.occupancy import FREE, OCCUPIED, UNKNOWN, GridOptions, OccupancyGrid
@@ -142,7 +142,7 @@ async def drive_exactly(bridge: Bridge, heard: Heard, source: str) -> None:
 async def test_transforms_are_exact_and_no_frame_has_two_parents(source: str, planar: bool) -> None:
     heard, last_ns = Heard(), START_NS + (ROWS - 1) * STEP_NS
     stamps = [START_NS + row * STEP_NS for row in range(ROWS)]
-    truth = [planar_pose(true_pose(each)) if planar else true_pose(each) for each in stamps]
+    truth = [project_to_plane(true_pose(each)) if planar else true_pose(each) for each in stamps]
     options = {"base_frame": "base_link", "planar": planar, "odometry": "odom" if source == "topic" else ""}
 
     def before(bridge: Bridge) -> None:
