@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
+import pytest
+
 from rse_pf.aws.account import open_account
 from rse_pf.aws.lifecycle.proof import prove
 from rse_pf.config.resource_names import ResourceNames
+from tests.kit.emulated_aws import is_localstack
 
 TAG = {"Key": "rse-pf", "Value": "rse-pf"}
 SERVERS = 230
 
 
+# LocalStack 4 breaks off an answer with an error of its own, and the repeated call lacks the fifth page.
+@pytest.mark.skipif(is_localstack(), reason="LocalStack fails within GetResources after four pages")
 def test_each_of_many_servers_that_still_runs_is_named_and_no_terminated_one(region: str) -> None:
     account = open_account(region)
     ec2 = account.client("ec2")
