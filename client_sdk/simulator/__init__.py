@@ -17,6 +17,7 @@ from client_sdk.simulator.drive import (
     render_along,
     render_frames,
     render_pairs,
+    rendered_drive,
     true_trajectory,
 )
 from client_sdk.simulator.world import World, make_world
@@ -32,5 +33,6 @@ __all__ = [
     "render_along",
     "render_frames",
     "render_pairs",
+    "rendered_drive",
     "true_trajectory",
 ]

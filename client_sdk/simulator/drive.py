@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 
+from client_sdk.datasets.dataset import Dataset
 from client_sdk.frontend import Frame
 from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import ROOM_M, ROOMS, World, make_world
@@ -28,6 +30,7 @@ __all__ = [
     "render_along",
     "render_frames",
     "render_pairs",
+    "rendered_drive",
     "true_trajectory",
 ]
 
@@ -62,6 +65,32 @@ _AROUND_FIRST_ROOM: _Corners = (
 )  # fmt: skip
 _DOOR_ON_WAY_THERE = (0.0, 2.05)
 _DOOR_ON_WAY_BACK = (0.0, 2.55)
+
+
+def rendered_drive(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Dataset:
+    """Return the frames of `render_frames` and their exact poses as a recording.
+
+    Arguments and errors are those of `render_frames`, but errors are raised at once.  A frame is rendered
+    when it is first read, after all frames before it, and stays in memory.
+    """
+    truth = true_trajectory(robot, robots, frames, seed, rooms)
+    rendering = render_frames(robot, robots, frames, seed, rooms)
+    rendered: list[Frame] = []
+
+    def read(row: int) -> Frame:
+        rendered.extend(islice(rendering, max(0, row + 1 - len(rendered))))
+        return rendered[row]
+
+    return Dataset(
+        name=f"world-{seed}",
+        camera=SIMULATED_CAMERA,
+        timestamps_s=tuple(truth.timestamps_s.tolist()),
+        truth=truth,
+        truth_kind="ground truth",
+        rows=tuple(range(frames)),
+        read=read,
+        notes=(f"rendered, {RATE_HZ:g} Hz: exact poses, a Kinect's noise",),
+    )
 
 
 def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Iterator[Frame]:

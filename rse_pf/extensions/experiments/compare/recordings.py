@@ -5,12 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 from client_sdk.datasets import CameraChoice, Dataset, open_dataset
 from client_sdk.datasets.thinning import median_interval_s
-from client_sdk.frontend import Frame
-from client_sdk.simulator import RATE_HZ, SIMULATED_CAMERA, render_frames, true_trajectory
+from client_sdk.simulator import rendered_drive
 from rse_pf.errors import UsageError
 
 __all__ = ["Drive", "drives_of", "open_recording"]
@@ -77,7 +75,7 @@ def open_recording(word: str, *, camera: CameraChoice | None = None, imu: bool |
     """
     world = _WORLD.fullmatch(word)
     if world is not None:
-        return _rendered(int(world[1]))
+        return rendered_drive(0, 1, _WORLD_FRAMES, int(world[1]))
     if word.startswith("world:"):
         raise UsageError(f"{word} names no rendered world", hint="write world: and a seed, such as world:3")
     dataset = open_dataset(word, camera=camera, imu=imu)
@@ -101,22 +99,3 @@ def _at_rates(dataset: Dataset, rates_hz: Sequence[float]) -> list[Drive]:
             continue
         drives.append(Drive(dataset=chosen, rate_hz=min(rate_hz, own_hz), notes=notes))
     return drives
-
-
-def _rendered(seed: int) -> Dataset:
-    truth = true_trajectory(0, 1, _WORLD_FRAMES, seed)
-
-    @cache
-    def frames() -> list[Frame]:
-        return list(render_frames(0, 1, _WORLD_FRAMES, seed))
-
-    return Dataset(
-        name=f"world-{seed}",
-        camera=SIMULATED_CAMERA,
-        timestamps_s=tuple(truth.timestamps_s.tolist()),
-        truth=truth,
-        truth_kind="ground truth",
-        rows=tuple(range(_WORLD_FRAMES)),
-        read=lambda row: frames()[row],
-        notes=(f"rendered, {RATE_HZ:g} Hz: exact poses, a Kinect's noise",),
-    )
