@@ -32,6 +32,7 @@ import rse_pf.extensions.experiments.demo.run as demo_run
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import percentile
 from client_sdk import frontend, point_map
+from client_sdk.datasets import Dataset
 from client_sdk.frontend import Features, Frame, FrontEndOptions
 from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajectory
 from client_sdk.tracking import tracker
@@ -130,11 +131,10 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
 
 def run_feature_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Run a robot of the demo on frames whose features were computed beforehand; entry point of a process."""
-    frames, features, truth = _read(Path(os.environ[_FEATURES]), spec.number)
+    recording, features = _read(Path(os.environ[_FEATURES]), spec.number)
     tracker.extract = lambda frame, options, plugin=None: features[frame.timestamp_s]
     point_map.PointMap.add = lambda *_: 0
-    loaded = demo_robot._Loaded(frames, truth, "ground truth", has_depth=True)
-    demo_robot._load = lambda *_: loaded
+    demo_robot._load = lambda *_: recording
     demo_robot.run_robot(spec, pipe)
 
 
@@ -154,19 +154,24 @@ def _prepare_robot(folder: Path, robot: int, robots: int, rooms: int, frames: in
     part.replace(_file_of(folder, robot))
 
 
-def _read(folder: Path, robot: int) -> tuple[list[Frame], dict[float, Features], Trajectory]:
-    """Return frames without an image, the features of each by its time stamp, and the true trajectory."""
+def _read(folder: Path, robot: int) -> tuple[Dataset, dict[float, Features]]:
+    """Return a recording whose frames have no image, and the features of each frame by its time stamp."""
     with np.load(_file_of(folder, robot)) as file:
         held = {name: file[name] for name in file.files}
     rgb = np.zeros((SIMULATED_CAMERA.height, SIMULATED_CAMERA.width, 3), dtype=np.uint8)
     depth_m = np.ones((SIMULATED_CAMERA.height, SIMULATED_CAMERA.width), dtype=np.float32)
     stamps = [float(stamp) for stamp in held["stamps"]]
     frames = [Frame(timestamp_s=stamp, rgb=rgb, depth_m=depth_m, camera=SIMULATED_CAMERA) for stamp in stamps]
-    return (
-        frames,
-        dict(zip(stamps, _split(held), strict=True)),
-        Trajectory(held["stamps"], held["poses"]),
+    recording = Dataset(
+        name="rendered",
+        camera=SIMULATED_CAMERA,
+        timestamps_s=tuple(stamps),
+        truth=Trajectory(held["stamps"], held["poses"]),
+        truth_kind="ground truth",
+        rows=tuple(range(len(frames))),
+        read=frames.__getitem__,
     )
+    return recording, dict(zip(stamps, _split(held), strict=True))
 
 
 def _split(held: dict[str, Any]) -> Iterator[Features]:

@@ -27,7 +27,7 @@ from client_sdk.plugins import load_features
 from client_sdk.point_map import write_ply
 from client_sdk.pose_answers import ask_robot
 from client_sdk.robot import Robot
-from client_sdk.source_facts import DoubtLog, unresolved
+from client_sdk.source_facts import unresolved
 from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.command_line.extras import is_installed
@@ -101,13 +101,15 @@ class DemoOptions:
         return max(_MERGED_FRAMES, frames_to_overlap(self.robots))
 
     def share(self, robot: int) -> Dataset:
-        """Return the part of the recording that the robot of number *robot* (from 0) plays.
+        """Return the part of the recording, or the rendered drive, that robot *robot* (from 0) plays.
 
         Raises UsageError.
         """
         from client_sdk.datasets import open_dataset
+        from client_sdk.simulator import rendered_drive
 
-        assert self.data is not None
+        if self.data is None:
+            return rendered_drive(robot, self.robots, self.frame_count, self.seed)
         recording = open_dataset(self.data, camera=self.camera, imu=self.imu)
         return recording.thinned(self.rate_hz).share(robot, self.robots)
 
@@ -182,21 +184,6 @@ class _Drive:
     weak_poses: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Loaded:
-    """The frames that a robot plays, with their truth.
-
-    ``is_thinned`` says whether frames of the recording are skipped.
-    """
-
-    frames: Any
-    truth: Trajectory | None
-    truth_kind: str
-    has_depth: bool
-    is_thinned: bool = False
-    log: DoubtLog = field(default_factory=DoubtLog)
-
-
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Load the frames, connect, wait for the start, track all frames and report; entry point of the process.
 
@@ -219,8 +206,8 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     from client_sdk import connect
 
     options = spec.options
-    loaded = await asyncio.to_thread(_load, spec, pipe)
-    frames, truth = loaded.frames, loaded.truth
+    recording = await asyncio.to_thread(_load, spec, pipe)
+    truth = recording.truth
 
     async def token() -> str:
         return await asyncio.to_thread(pipe.fresh_token)
@@ -247,17 +234,17 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             else:
                 start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
                 mapper = Mapper(
-                    ask=ask, depth=loaded.has_depth, options=options.frontend_options, T_world_start=start,
+                    ask=ask, depth=recording.has_depth, options=options.frontend_options, T_world_start=start,
                     keyframes_of=spec.name if options.merge else "", features=load_features(options.features),
                 )  # fmt: skip
-            pipe.send(ChildReady(len(frames)))
+            pipe.send(ChildReady(len(recording)))
             began = planned = await asyncio.to_thread(pipe.wait_start)
             recorder = LiveRecorder(shared, time.monotonic, began).start() if options.live else None
-            check = _make_check(options, loaded)
+            check = _make_check(options, recording)
             first_s = time.monotonic()
-            waiting = iter(frames)
+            waiting = iter(recording)
             following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
-            for row in range(len(frames)):
+            for row in range(len(recording)):
                 frame: Frame | None = await following
                 if frame is None:  # the recording skips damaged images, so that there may be fewer frames
                     break
@@ -294,25 +281,25 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 commands=drive.commands,
                 trajectory=trajectory,
                 truth=truth,
-                truth_kind=loaded.truth_kind,
+                truth_kind=recording.truth_kind,
                 stats={"reconnects": robot.stats.reconnects, "resent": robot.stats.resent},
                 is_metric=_is_metric(mapper),
-                check=await asyncio.to_thread(_checked, check, mapper, loaded, options.accepted),
+                check=await asyncio.to_thread(_checked, check, mapper, recording, options.accepted),
             )
         )
 
 
-def _make_check(options: DemoOptions, loaded: _Loaded) -> DriveCheck | None:
+def _make_check(options: DemoOptions, recording: Dataset) -> DriveCheck | None:
     """Return a check of the drive over a recording; None if none is wanted, or the extension was removed."""
     if not (options.check and options.data is not None and is_installed("client_sdk.check")):
         return None
     from client_sdk.check.drive_check import DriveCheck
 
-    return DriveCheck(is_thinned=loaded.is_thinned)
+    return DriveCheck(is_thinned=int(np.ptp(recording.rows)) >= len(recording))
 
 
 def _checked(
-    check: DriveCheck | None, mapper: Mapper | LiveMapper, loaded: _Loaded, accepted: Sequence[str]
+    check: DriveCheck | None, mapper: Mapper | LiveMapper, recording: Dataset, accepted: Sequence[str]
 ) -> dict[str, Any] | None:
     """Return the result of *check*; None without a check.
 
@@ -322,9 +309,9 @@ def _checked(
         return None
     from client_sdk.check.motion import MotionReference
 
-    reference = MotionReference.of_truth(loaded.truth, loaded.truth_kind, is_camera=False)
+    reference = MotionReference.of_truth(recording.truth, recording.truth_kind, is_camera=False)
     tracked = mapper if isinstance(mapper, Mapper) else None
-    return check.finish(tracked, reference, unresolved(loaded.log.doubts, accepted), accepted)
+    return check.finish(tracked, reference, unresolved(recording.log.doubts, accepted), accepted)
 
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:
@@ -377,23 +364,13 @@ def _since(began: float) -> float:
     return round(time.monotonic() - began, 6)
 
 
-def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
-    """Open the robot's part of the recording, or render its frames, and return frames and truth."""
-    options, number = spec.options, spec.number
-    if options.data is not None:
-        recording = options.share(number)
-        is_thinned = int(np.ptp(recording.rows)) >= len(recording)
-        return _Loaded(
-            recording, recording.truth, recording.truth_kind, recording.has_depth, is_thinned, recording.log
-        )
-    from client_sdk.simulator import render_frames, true_trajectory
-
-    truth = true_trajectory(number, options.robots, options.frame_count, options.seed)
-    frames: list[Frame] = []
-    for frame in render_frames(number, options.robots, options.frame_count, options.seed):
-        frames.append(frame)
-        pipe.send(FrameDone(len(frames)))
-    return _Loaded(frames, truth, "ground truth", True)
+def _load(spec: RobotSpec, pipe: ParentPipe) -> Dataset:
+    """Return the recording that the robot plays; a rendered one is rendered here, before the start."""
+    recording = spec.options.share(spec.number)
+    for row in recording.rows if spec.options.data is None else ():
+        recording.read(row)
+        pipe.send(FrameDone(row + 1))
+    return recording
 
 
 def _write(
