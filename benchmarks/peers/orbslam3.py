@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.frame.registry import Recordings, benchmark
 from benchmarks.frame.report import say
-from client_sdk.datasets import CameraChoice, associate_stamps
+from client_sdk.datasets import CameraChoice, Dataset, associate_stamps
 from client_sdk.frontend import load_opencv
 from client_sdk.rigs.benchmark_files import read_euroc_camera
 from client_sdk.rigs.intrinsics import Intrinsics
@@ -41,7 +41,7 @@ from client_sdk.trajectory_error import accuracy
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.compare.configurations import Configuration, configurations_of
-from rse_pf.extensions.experiments.compare.recordings import Drive, drives_of
+from rse_pf.extensions.experiments.compare.recordings import drives_of
 from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 from rse_pf.extensions.experiments.compare.tracking_run import longest_gap_s, track
 from rse_pf.extensions.experiments.results.markdown import page, table
@@ -143,10 +143,10 @@ class Job:
     T_camera_peer: Array
 
 
-def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
+def job_of(recordings: Path, drive: Dataset, sensor: Sensor) -> Job:
     """Return the peer's job for a drive."""
-    name, stamps_s = drive.dataset.name, drive.dataset.timestamps_s
-    folder, rows = recordings / name, drive.dataset.rows
+    name, stamps_s = drive.name, drive.timestamps_s
+    folder, rows = recordings / name, drive.rows
     same = np.eye(4)
     if name in (_KITCHEN, _TURNING):
         colours, depths = _listed(folder / "rgb.txt"), _listed(folder / "depth.txt")
@@ -183,7 +183,7 @@ def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
         (stamp, str(folder / "image_0" / names[row]), str(folder / "image_1" / names[row]))
         for stamp, row in zip(stamps_s, rows, strict=True)
     ]
-    lens = Intrinsics(camera=drive.dataset.camera)
+    lens = Intrinsics(camera=drive.camera)
     settings = _yaml(lens, sensor, drive.rate_hz, [])
     if sensor == "STEREO":
         numbers = [float(word) for word in (folder / "calib.txt").read_text().splitlines()[1].split()[1:]]
@@ -191,7 +191,7 @@ def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
     return Job(settings=settings, frames=frames, T_camera_peer=same)
 
 
-def run_peer(args: Options, drive: Drive, sensor: Sensor, job: Job) -> dict[str, Any]:
+def run_peer(args: Options, drive: Dataset, sensor: Sensor, job: Job) -> dict[str, Any]:
     """Run the peer once in a process of its own; return its figures."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -219,7 +219,7 @@ def run_peer(args: Options, drive: Drive, sensor: Sensor, job: Job) -> dict[str,
     return figures
 
 
-def run_ours(configuration: Configuration, drive: Drive) -> dict[str, Any]:
+def run_ours(configuration: Configuration, drive: Dataset) -> dict[str, Any]:
     """Run our tracker once, as `rse-pf compare` does; return its figures."""
     run = asyncio.run(track(configuration, drive, InProcessSolver(PlatformSettings())))
     return {
@@ -229,17 +229,16 @@ def run_ours(configuration: Configuration, drive: Drive) -> dict[str, Any]:
     }
 
 
-def _scored(estimate: Trajectory, drive: Drive, sensor: Sensor, T_camera_peer: Array) -> dict[str, Any]:
+def _scored(estimate: Trajectory, drive: Dataset, sensor: Sensor, T_camera_peer: Array) -> dict[str, Any]:
     """Return poses, gap and errors of a trajectory of the peer's camera."""
-    dataset = drive.dataset
-    assert dataset.truth is not None
+    assert drive.truth is not None
     scored: dict[str, Any] = {
         "posed": len(estimate),
-        "longest_gap_s": longest_gap_s(np.array(dataset.timestamps_s), estimate.timestamps_s),
+        "longest_gap_s": longest_gap_s(np.array(drive.timestamps_s), estimate.timestamps_s),
         "ate_cm": None, "rpe_cm": None, "rpe_deg": None,
     }  # fmt: skip
-    body = None if dataset.T_body_camera is None else dataset.T_body_camera @ T_camera_peer
-    truth = Trajectory(dataset.truth.timestamps_s, dataset.truth.T_world_camera @ T_camera_peer)
+    body = None if drive.T_body_camera is None else drive.T_body_camera @ T_camera_peer
+    truth = Trajectory(drive.truth.timestamps_s, drive.truth.T_world_camera @ T_camera_peer)
     try:
         errors = accuracy(estimate, truth, with_scale=sensor == "MONOCULAR", T_body_camera=body)
     except UsageError:
@@ -447,8 +446,8 @@ def run_benchmark(args: Options) -> dict[str, Any]:
             drives_of([recording], row.rates_hz, camera=camera, imu=False),
             strict=True,
         ):
-            key = (drive.name, row.sensor)
-            if args.only in f"{drive.name} {row.sensor}":
+            key = (drive.name_at_rate, row.sensor)
+            if args.only in f"{drive.name_at_rate} {row.sensor}":
                 known[key] = {
                     **known.get(key, {}),
                     **_measured(args, row, drive, own, known.get(key, {}).get("peer", [])),
@@ -463,12 +462,12 @@ def run_benchmark(args: Options) -> dict[str, Any]:
 
 
 def _measured(
-    args: Options, row: Row, drive: Drive, own: Drive, earlier: Sequence[dict[str, Any]]
+    args: Options, row: Row, drive: Dataset, own: Dataset, earlier: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
     """Measure a row, our tracker on *own*; with --more, add the peer's runs to the *earlier* ones."""
     before = earlier if args.more else ()
     measured: dict[str, Any] = {
-        "name": drive.name, "sensor": row.sensor, "frames": len(drive.dataset),
+        "name": drive.name_at_rate, "sensor": row.sensor, "frames": len(drive),
         "alignment": "Sim(3)" if row.sensor == "MONOCULAR" else "SE(3)",
     }  # fmt: skip
     if args.part != "peer":

@@ -42,6 +42,7 @@ class Dataset:
         T_body_camera: ``(4, 4)``, m, pose of the camera of the frames in the body of its rig, which each
             frame gets; None if it is not known.  *truth* is the trajectory of the camera in any case.
         imu: All samples of the IMU, or None; each frame gets those since the frame before it.
+        thinned_to_hz: Frames per second on average that `thinned` has left; None for all frames.
         log: Collects the doubts about the recording; recordings that `thinned` and `share` return have the
             same log.
     """
@@ -58,7 +59,18 @@ class Dataset:
     has_stereo: bool = False
     T_body_camera: Array | None = None
     imu: ImuTrack | None = None
+    thinned_to_hz: float | None = None
     log: DoubtLog = field(default_factory=DoubtLog)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second: `thinned_to_hz`, else by the median time between frames; 1 without one."""
+        return self.thinned_to_hz or 1.0 / (median_interval_s(self.timestamps_s) or 1.0)
+
+    @property
+    def name_at_rate(self) -> str:
+        """Name and rate as text for the user, such as ``kitchen at 5 Hz``."""
+        return f"{self.name} at {self.rate_hz:.3g} Hz"
 
     @property
     def span_s(self) -> tuple[float, float] | None:
@@ -119,7 +131,7 @@ class Dataset:
         """
         thinning = Thinning(rate_hz, interval_s=median_interval_s(self.timestamps_s))
         indices = [index for index, stamp_s in enumerate(self.timestamps_s) if thinning.selects(stamp_s)]
-        return self._select(indices)
+        return replace(self._select(indices), thinned_to_hz=min(rate_hz, self.rate_hz))
 
     def share(self, robot: int, robots: int) -> Dataset:
         """Return the part of the recording that one robot of several replays as its own drive.

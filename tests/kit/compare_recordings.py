@@ -10,7 +10,6 @@ import numpy as np
 from client_sdk.datasets import Dataset
 from client_sdk.frontend import Frame
 from client_sdk.trajectory import Trajectory
-from rse_pf.extensions.experiments.compare.recordings import Drive
 from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 
 __all__ = ["flat_drive"]
@@ -22,12 +21,12 @@ def flat_drive(
     depth: bool = True,
     has_truth: bool = True,
     change: Callable[[int, Frame], Frame] = lambda row, frame: frame,
-) -> Drive:
+) -> Dataset:
     """Return a drive at 10 Hz; *change* may replace its frames."""
     stamps_s = np.arange(frames) / 10
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = STEP_M * np.arange(frames)
-    dataset = Dataset(
+    return Dataset(
         name="flat",
         camera=CAMERA,
         timestamps_s=tuple(stamps_s.tolist()),
@@ -37,7 +36,6 @@ def flat_drive(
         read=lambda row: change(row, frame_at(row, depth=depth)),
         has_depth=depth,
     )
-    return Drive(dataset=dataset, rate_hz=10.0)
 
 
 def black(row: int, frame: Frame) -> Frame:

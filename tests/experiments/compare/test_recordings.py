@@ -15,14 +15,14 @@ from tests.kit.compare_recordings import flat_drive
 @pytest.fixture
 def flat(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording of 10 Hz behind every path."""
-    monkeypatch.setattr(recordings, "open_recording", lambda word, **_: flat_drive(20).dataset)
+    monkeypatch.setattr(recordings, "open_recording", lambda word, **_: flat_drive(20))
 
 
 @pytest.mark.usefixtures("flat")
 def test_each_rate_is_a_drive_and_one_above_the_recordings_plays_all_and_says_so() -> None:
     drives = drives_of(["x"], [5.0, 60.0, 10.0])
 
-    assert [(drive.rate_hz, len(drive.dataset)) for drive in drives] == [
+    assert [(drive.rate_hz, len(drive)) for drive in drives] == [
         (5.0, 10),
         (pytest.approx(10.0), 20),
     ]

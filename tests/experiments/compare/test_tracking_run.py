@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from client_sdk.datasets import Dataset
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.extensions.experiments.compare.configurations import Configuration, configurations_of
-from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.solvers import InProcessSolver
 from rse_pf.extensions.experiments.compare.tracking_run import TrackingRun, longest_gap_s, track
 from tests.client_sdk.mapper.test_imu import leaning_first, with_imu  # noqa: F401
@@ -23,7 +23,7 @@ pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 DEFAULT = Configuration(name="default")
 
 
-def run(drive: Drive, configuration: Configuration = DEFAULT) -> TrackingRun:
+def run(drive: Dataset, configuration: Configuration = DEFAULT) -> TrackingRun:
     return asyncio.run(track(configuration, drive, InProcessSolver(PlatformSettings())))
 
 

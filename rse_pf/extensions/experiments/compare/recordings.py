@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 from client_sdk.datasets import CameraChoice, Dataset, open_dataset
-from client_sdk.datasets.thinning import median_interval_s
 from client_sdk.simulator import rendered_drive
 from rse_pf.errors import UsageError
 
-__all__ = ["Drive", "drives_of", "open_recording"]
+__all__ = ["drives_of", "open_recording"]
 
 # Pattern of the name of a rendered world, with its seed.
 _WORLD = re.compile(r"world:(\d{1,9})")
@@ -21,39 +20,23 @@ _WORLD_FRAMES = 80
 _MAX_RATE_RATIO = 1.05
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Drive:
-    """A recording thinned to one rate.
-
-    ``rate_hz`` is the rate of its frames, ``notes`` are shown to the user.
-    """
-
-    dataset: Dataset
-    rate_hz: float
-    notes: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """The name of the recording and the rate, as text for the user."""
-        return f"{self.dataset.name} at {self.rate_hz:.3g} Hz"
-
-
 def drives_of(
     words: Sequence[str],
     rates_hz: Sequence[float],
     *,
     camera: CameraChoice | None = None,
     imu: bool | None = None,
-) -> list[Drive]:
+) -> list[Dataset]:
     """Return each of the recordings *words* at each of *rates_hz*.
 
     Without rates, each recording is returned at its own rate.  Rates that give the same frames of a recording
-    give one drive.  *camera* and *imu* are those of `open_dataset`.
+    give one drive; a note says that a rate is above that of its recording.  *camera* and *imu* are those of
+    `open_dataset`.
 
     Raises:
         UsageError: A recording cannot be read, or two recordings have the same name.
     """
-    drives: list[Drive] = []
+    drives: list[Dataset] = []
     names: dict[str, str] = {}
     for word in words:
         dataset = open_recording(word, camera=camera, imu=imu)
@@ -83,19 +66,14 @@ def open_recording(word: str, *, camera: CameraChoice | None = None, imu: bool |
     return dataset
 
 
-def _at_rates(dataset: Dataset, rates_hz: Sequence[float]) -> list[Drive]:
-    interval_s = median_interval_s(dataset.timestamps_s)
-    own_hz = 1.0 / interval_s if interval_s > 0 else 1.0
-    drives: list[Drive] = []
+def _at_rates(recording: Dataset, rates_hz: Sequence[float]) -> list[Dataset]:
+    drives: list[Dataset] = []
+    own_hz = recording.rate_hz
     for rate_hz in rates_hz or (own_hz,):
-        notes = dataset.notes
+        drive = recording.thinned(rate_hz)
         if rate_hz > _MAX_RATE_RATIO * own_hz:
-            notes = (
-                *notes,
-                f"--rate {rate_hz:g} is above the recording's {own_hz:.3g} Hz: all frames are played",
-            )
-        chosen = dataset.thinned(rate_hz)
-        if any(chosen.rows == other.dataset.rows for other in drives):
-            continue
-        drives.append(Drive(dataset=chosen, rate_hz=min(rate_hz, own_hz), notes=notes))
+            note = f"--rate {rate_hz:g} is above the recording's {own_hz:.3g} Hz: all frames are played"
+            drive = replace(drive, notes=(*drive.notes, note))
+        if all(drive.rows != other.rows for other in drives):
+            drives.append(drive)
     return drives

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from client_sdk.datasets import Dataset
 from client_sdk.trajectory_error import MAX_TRUTH_GAP_S, SAME_STAMP_S, STEP_S
 from rse_pf.extensions.experiments.compare.configurations import Configuration
-from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.tracking_run import TrackingRun
 
 __all__ = ["drive_heading", "make_report", "row_of", "runs_line", "table_lines", "tolerance_line"]
@@ -28,7 +28,7 @@ _COLUMNS = (
 
 def row_of(
     configuration: Configuration,
-    drive: Drive,
+    drive: Dataset,
     runs: Sequence[TrackingRun],
     evo_ate_cm: Sequence[float | None],
 ) -> dict[str, Any]:
@@ -44,12 +44,12 @@ def row_of(
         figures[f"{name}_ms"] = _spread([run.times_ms[name] for run in runs])
     return {
         "configuration": configuration.name,
-        "recording": drive.dataset.name,
-        "sensors": drive.dataset.sensors,
+        "recording": drive.name,
+        "sensors": drive.sensors,
         "rate_hz": round(drive.rate_hz, 3),
         "alignment": "SE(3)" if runs[0].is_metric else "Sim(3)",
-        "truth": drive.dataset.truth_kind,
-        "frame_of_truth": "camera" if drive.dataset.T_body_camera is None else "body",
+        "truth": drive.truth_kind,
+        "frame_of_truth": "camera" if drive.T_body_camera is None else "body",
         "runs": len(runs),
         "same_poses_in_all_runs": len({run.digest for run in runs}) == 1 if len(runs) > 1 else None,
         "poses_digest": [run.digest for run in runs],
@@ -88,15 +88,15 @@ def make_report(
     }
 
 
-def drive_heading(drive: Drive, rows: Sequence[Mapping[str, Any]]) -> str:
+def drive_heading(drive: Dataset, rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the line above the table of a drive: name, sensors, frames, duration, truth and alignment."""
-    dataset, stamps_s = drive.dataset, drive.dataset.timestamps_s
+    stamps_s = drive.timestamps_s
     kinds = list(dict.fromkeys(row["alignment"] for row in rows))
-    frames = f"{drive.name}, {dataset.sensors}: {len(dataset)} frames, {stamps_s[-1] - stamps_s[0]:.1f} s"
-    if dataset.truth is None:
+    frames = f"{drive.name_at_rate}, {drive.sensors}: {len(drive)} frames, {stamps_s[-1] - stamps_s[0]:.1f} s"
+    if drive.truth is None:
         return f"{frames}; no truth"
-    where = "" if dataset.T_body_camera is None else " of the body"
-    return f"{frames}; {dataset.truth_kind}{where}, {' and '.join(kinds)}"
+    where = "" if drive.T_body_camera is None else " of the body"
+    return f"{frames}; {drive.truth_kind}{where}, {' and '.join(kinds)}"
 
 
 def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:

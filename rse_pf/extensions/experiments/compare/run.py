@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from client_sdk.datasets import Dataset
 from client_sdk.frontend import load_opencv
 from client_sdk.source_facts import unresolved
 from client_sdk.trajectory import write_trajectory
@@ -17,7 +18,6 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.extensions.experiments.compare.configurations import Configuration
 from rse_pf.extensions.experiments.compare.evo_figures import evo_ate_cm, evo_command
-from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.report import (
     drive_heading,
     make_report,
@@ -50,7 +50,7 @@ class CompareOptions:
     """
 
     configurations: Sequence[Configuration]
-    drives: Sequence[Drive]
+    drives: Sequence[Dataset]
     runs: int = 1
     out: Path = Path("out-compare")
     platform: bool = False
@@ -67,7 +67,7 @@ def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
     _make_folder(options.out)
     load_opencv().setNumThreads(1)
     for drive in options.drives:
-        show(*(f"note: {drive.dataset.name}: {note}" for note in drive.notes))
+        show(*(f"note: {drive.name}: {note}" for note in drive.notes))
     doubts = _doubts(options)
     show(*doubts)
     before = environment(settings)
@@ -99,12 +99,8 @@ def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
 
 def _doubts(options: CompareOptions) -> list[str]:
     """Return a line for each finding about the recordings that the user has not accepted."""
-    datasets = {drive.dataset.name: drive.dataset for drive in options.drives}
-    return [
-        doubt.line()
-        for dataset in datasets.values()
-        for doubt in unresolved(dataset.log.doubts, options.accepted)
-    ]
+    logs = {drive.name: drive.log for drive in options.drives}
+    return [doubt.line() for log in logs.values() for doubt in unresolved(log.doubts, options.accepted)]
 
 
 async def _compare(
@@ -162,23 +158,23 @@ async def _solvers(
 
 
 async def _run(
-    options: CompareOptions, configuration: Configuration, drive: Drive, solver: MeteredSolver, number: int
+    options: CompareOptions, configuration: Configuration, drive: Dataset, solver: MeteredSolver, number: int
 ) -> TrackingRun:
     """Track *drive* once with *configuration*, and write the trajectory of run *number* to a file."""
 
     def progress(frames: int) -> None:
-        doing = f"{drive.name}: {configuration.name}, run {number}"
-        show_progress(f"{doing}, frame {frames} of {len(drive.dataset)}", is_over=False)
+        doing = f"{drive.name_at_rate}: {configuration.name}, run {number}"
+        show_progress(f"{doing}, frame {frames} of {len(drive)}", is_over=False)
 
     run = await track(configuration, drive, solver, progress)
-    name = f"{drive.dataset.name}-{drive.rate_hz:.3g}hz-{configuration.name}-{number}.txt"
+    name = f"{drive.name}-{drive.rate_hz:.3g}hz-{configuration.name}-{number}.txt"
     path = options.out / TRAJECTORIES / _NOT_PLAIN.sub("_", name)
-    body = drive.dataset.T_body_camera
+    body = drive.T_body_camera
     write_trajectory(path, run.trajectory, is_metric=run.is_metric, T_body_camera=body)
     return run
 
 
-def _panel(drive: Drive, rows: Sequence[Mapping[str, Any]], runs: Sequence[TrackingRun]) -> Panel:
+def _panel(drive: Dataset, rows: Sequence[Mapping[str, Any]], runs: Sequence[TrackingRun]) -> Panel:
     """Return the panel of a drive with the path of each configuration.
 
     Paths are aligned with the true one; without a truth each path is in the frame of its own first camera.
@@ -191,7 +187,8 @@ def _panel(drive: Drive, rows: Sequence[Mapping[str, Any]], runs: Sequence[Track
     truths = [run.errors.truth for run in runs if run.errors is not None]
     is_metric = bool(truths) or all(run.is_metric for run in runs)
     truth = max(truths, key=len) if truths else None
-    return Panel(title=drive.name, truth=truth, paths=tuple(paths), unit="m" if is_metric else "units")
+    unit = "m" if is_metric else "units"
+    return Panel(title=drive.name_at_rate, truth=truth, paths=tuple(paths), unit=unit)
 
 
 def _make_folder(folder: Path) -> None:

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from client_sdk.datasets import Dataset
 from client_sdk.mapper import Mapper
 from client_sdk.trajectory import Trajectory
 from client_sdk.trajectory_error import Accuracy, accuracy
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.extensions.experiments.compare.configurations import Configuration, failure_line
-from rse_pf.extensions.experiments.compare.recordings import Drive
 from rse_pf.extensions.experiments.compare.solvers import MeteredSolver
 from rse_pf.geometry import Array
 
@@ -60,7 +60,7 @@ class _Costs:
 
 async def track(
     configuration: Configuration,
-    drive: Drive,
+    drive: Dataset,
     solver: MeteredSolver,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> TrackingRun:
@@ -72,23 +72,22 @@ async def track(
     Raises:
         UsageError: The recording cannot be read, or a function of the configuration fails.
     """
-    dataset = drive.dataset
-    if configuration.depth and not (dataset.has_depth or dataset.has_stereo):
+    if configuration.depth and not (drive.has_depth or drive.has_stereo):
         raise UsageError(
-            f"{configuration.name} needs depth, and {dataset.name} has none", hint="leave out depth = true"
+            f"{configuration.name} needs depth, and {drive.name} has none", hint="leave out depth = true"
         )
     slots: dict[str, Any] = dict(configuration.slots)
     mapper = Mapper(
         ask=solver.ask,
         options=configuration.frontend,
         monocular=configuration.monocular,
-        depth=dataset.has_depth if configuration.depth is None else configuration.depth,
+        depth=drive.has_depth if configuration.depth is None else configuration.depth,
         keyframes_of=_ROBOT,
         adds_frames=False,
         **slots,
     )
     costs, tracked = _Costs(), list[tuple[float, int, Array | None]]()
-    for number, frame in enumerate(dataset, start=1):
+    for number, frame in enumerate(drive, start=1):
         sent, server_s, inside_s = solver.sent_bytes, solver.server_s, solver.inside_s
         if configuration.depth is False and frame.stereo is not None:
             frame = replace(frame, stereo=None)
@@ -102,7 +101,7 @@ async def track(
             if not configuration.slots or cause is None:
                 raise
             raise UsageError(
-                f"frame {number} of {drive.name}: {failure_line(configuration.source, cause)}",
+                f"frame {number} of {drive.name_at_rate}: {failure_line(configuration.source, cause)}",
                 hint=f"correct {configuration.source}",
             ) from error
         took_s = time.process_time() - began_s
@@ -133,14 +132,14 @@ def longest_gap_s(stamps_s: Array, posed_s: Array) -> float:
 
 
 def score(
-    estimate: Trajectory, drive: Drive, *, is_metric: bool, T_body_camera: Array | None = None
+    estimate: Trajectory, drive: Dataset, *, is_metric: bool, T_body_camera: Array | None = None
 ) -> tuple[Accuracy | None, str]:
     """Return the errors of *estimate* against the truth of *drive* and "", or None and the reason."""
-    truth = drive.dataset.truth
+    truth = drive.truth
     if truth is None or len(truth) < 2:
         return None, "the recording has no truth: no ATE, no RPE"
     if len(estimate) < _MIN_POSES:
-        posed = f"{len(estimate)} of {len(drive.dataset)} frames have a pose"
+        posed = f"{len(estimate)} of {len(drive)} frames have a pose"
         return None, f"{posed}, an evaluation needs {_MIN_POSES}"
     try:
         return accuracy(estimate, truth, with_scale=not is_metric, T_body_camera=T_body_camera), ""
@@ -151,13 +150,13 @@ def score(
 def _run_of(
     mapper: Mapper,
     report: dict[str, Any],
-    drive: Drive,
+    drive: Dataset,
     costs: _Costs,
     tracked: list[tuple[float, int, Array | None]],
     finish_ms: float,
 ) -> TrackingRun:
     trajectory, is_metric = mapper.trajectory, mapper.scale.startswith("metric")
-    body = drive.dataset.T_body_camera
+    body = drive.T_body_camera
     errors, why = score(trajectory, drive, is_metric=is_metric, T_body_camera=body)
     if mapper.start_reason:
         why = f"no frame has a pose: {mapper.start_reason}"
@@ -170,7 +169,7 @@ def _run_of(
     if arrived:
         came = Trajectory(np.array([each[0] for each in arrived]), np.array([each[1] for each in arrived]))
         online, _ = score(came, drive, is_metric=is_metric, T_body_camera=body)
-    stamps_s = np.array(drive.dataset.timestamps_s)
+    stamps_s = np.array(drive.timestamps_s)
     figures: dict[str, float | int | None] = {
         "frames": len(stamps_s),
         "posed": len(trajectory),
