@@ -10,14 +10,13 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.auto_close import AutoClose
 from client_sdk.bags.bag_file import BagFile, BrokenMessage, RawMessage, Topic, open_bag_file
 from client_sdk.bags.choose import (
     ChosenTopics,
@@ -41,9 +40,10 @@ from client_sdk.bags.realsense_recording import stated_depth_unit_m, stated_T_co
 from client_sdk.bags.registration import register_depth
 from client_sdk.bags.stereo import pair_of
 from client_sdk.bags.stream import ImageStream
+from client_sdk.datasets.dataset import Dataset
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import ImageMap, map_to_pinhole
-from client_sdk.rigs.imu_track import ImuTrack, with_imu
+from client_sdk.rigs.imu_track import ImuTrack
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera
 from client_sdk.source_facts import (
@@ -133,70 +133,48 @@ class BagOptions:
                 )
 
 
-@dataclass(slots=True, eq=False)
-class Bag(AutoClose):
-    """The frames of an open bag, for iteration or to `read` single frames; a context manager that closes it.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bag(Dataset):
+    """The recording of an open bag, to be closed, or used in ``with``.
 
-    Frames of the iteration have the samples of ``imu`` since the frame before; those of `read` have none.
+    `read` raises UsageError if an image cannot be decoded, and reads ascending rows without seeking.
 
     Attributes:
-        name: Name of the file or folder.
-        camera: Pinhole camera of all frames; the rectified left one for a stereo pair.
-        timestamps_s: Ascending time stamps of the frames, s.
-        has_depth: Whether frames have depth.
-        truth: Trajectory of the camera with which an estimate can be compared; None if the bag has none.
-        truth_kind: ``ground truth``, ``reference`` for poses that another program estimated, or ``none``.
-        notes: Sentences for the user on the topics that are used, and on what was assumed.
-        chosen: The topics that are used.
-        imu: All samples of the IMU; None without an IMU.
-        log: Doubts about the bag: unlikely facts, and messages that were left out.
+        topics: The topics that are used: ``colour`` (the left one of a stereo pair), ``right``, ``depth`` and
+            ``imu``, as far as there are any.
     """
+
+    topics: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _BagReader:
+    """Read the frames of an open bag, without the samples of its IMU."""
 
     name: str
     camera: Camera
     timestamps_s: tuple[float, ...]
     has_depth: bool
-    truth: Trajectory | None
-    truth_kind: Literal["ground truth", "reference", "none"]
-    notes: tuple[str, ...]
-    chosen: ChosenTopics
-    imu: ImuTrack | None
-    log: DoubtLog
-    _file: BagFile
-    _stream: ImageStream
-    _pairs: tuple[_Pair, ...]
-    _colour_rectifier: _TopicRectifier
-    _depth_rectifier: _TopicRectifier
-    _depth_scale: float
-    _is_float_depth: bool = False
-    _registration: tuple[Camera, Array] | None = None
-    _rectification: Rectification | None = None
-    _no_depth: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
-
-    @property
-    def has_stereo(self) -> bool:
-        """Whether frames have the right image of a stereo pair; ``camera`` is then the rectified left one."""
-        return self._rectification is not None
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return with_imu(map(self.read, range(len(self))), self.imu)
+    file: BagFile
+    stream: ImageStream
+    pairs: tuple[_Pair, ...]
+    colour_rectifier: _TopicRectifier
+    depth_rectifier: _TopicRectifier
+    depth_scale: float
+    is_float_depth: bool
+    registration: tuple[Camera, Array] | None
+    rectification: Rectification | None
+    no_depth: npt.NDArray[np.float32]
 
     def read(self, row: int) -> Frame:
-        """Return the frame with the index *row*; frames in ascending order are read without seeking.
-
-        Raises:
-            UsageError: The image cannot be decoded.
-        """
-        pair = self._pairs[row]
-        raw = self._stream.take(pair)
+        """Return the frame with the index *row*; raises UsageError if the image cannot be decoded."""
+        pair = self.pairs[row]
+        raw = self.stream.take(pair)
         try:
-            colours = decode_colour(self._file.parse(raw[0]))
-            if self._rectification is not None:
-                return self._stereo_frame(row, self._rectification, colours, raw[1])
-            rgb = self._colour_rectifier.of(pair[0]).colour(colours)
+            colours = decode_colour(self.file.parse(raw[0]))
+            if self.rectification is not None:
+                return self._stereo_frame(row, self.rectification, colours, raw[1])
+            rgb = self.colour_rectifier.of(pair[0]).colour(colours)
             depth_m = self._depth_of(pair, raw)
         except BrokenMessage as error:
             raise UsageError(
@@ -208,11 +186,11 @@ class Bag(AutoClose):
         self, row: int, rectify: Rectification, colours: npt.NDArray[np.uint8], raw: RawMessage
     ) -> Frame:
         cv2 = load_opencv()
-        gray = cv2.cvtColor(decode_colour(self._file.parse(raw)), cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(decode_colour(self.file.parse(raw)), cv2.COLOR_RGB2GRAY)
         return Frame(
             timestamp_s=self.timestamps_s[row],
             rgb=rectify.left(colours),
-            depth_m=self._no_depth,
+            depth_m=self.no_depth,
             camera=self.camera,
             stereo=rectify.right(gray),
             T_body_camera=rectify.T_body_camera,
@@ -220,21 +198,21 @@ class Bag(AutoClose):
 
     def _depth_of(self, pair: _Pair, raw: list[RawMessage]) -> npt.NDArray[np.float32]:
         if not self.has_depth:
-            return self._no_depth
-        message = self._file.parse(raw[1])
-        if self._is_float_depth:
-            depth_m = decode_depth(message, 1.0) / np.float32(self._depth_scale)
+            return self.no_depth
+        message = self.file.parse(raw[1])
+        if self.is_float_depth:
+            depth_m = decode_depth(message, 1.0) / np.float32(self.depth_scale)
         else:
-            depth_m = decode_depth(message, self._depth_scale)
-        depth_m = self._depth_rectifier.of(pair[1]).depth(depth_m)
-        if self._registration is None:
+            depth_m = decode_depth(message, self.depth_scale)
+        depth_m = self.depth_rectifier.of(pair[1]).depth(depth_m)
+        if self.registration is None:
             return depth_m
-        return register_depth(depth_m, *self._registration, self.camera)
+        return register_depth(depth_m, *self.registration, self.camera)
 
     def close(self) -> None:
-        """Release the file; no frame can be read any more."""
-        self._stream.close()
-        self._file.close()
+        """Close the file; no frame can be read any more."""
+        self.stream.close()
+        self.file.close()
 
 
 def open_bag(path: Path | str, options: BagOptions | None = None) -> Bag:
@@ -291,13 +269,43 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
     usual = 1.0 if is_float else _USUAL_DEPTH_SCALE
     depth_scale = options.depth_scale or (usual if unit_m is None else 1.0 / unit_m)
     stream = ImageStream(file, list({pair[0] for pair in pairs[0]}), use_log_time=index.uses_log_time)
-    bag = Bag(
+    reader = _BagReader(
         name=name,
         camera=camera,
         timestamps_s=tuple(stamp / 1e9 for stamp in stamps_ns),
         has_depth=chosen.depth is not None,
+        file=file,
+        stream=stream,
+        pairs=tuple(pairs),
+        colour_rectifier=_TopicRectifier(times, [map_to_pinhole(each, lens.camera) for each in lenses]),
+        depth_rectifier=depth_rectifier,
+        depth_scale=depth_scale,
+        is_float_depth=is_float,
+        registration=registration,
+        rectification=rectification,
+        no_depth=no_depth,
+    )
+    facts = SourceFacts(
+        name=name,
+        cameras=[CameraFacts(stated_by=_stated_by(chosen, options), lens=each) for each in lenses],
+        depth=_depth_facts(
+            reader, is_unit_stated=is_float or unit_m is not None or options.depth_scale is not None
+        ),
+        times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(reader.timestamps_s))],
+        losses=tuple(_loss_facts(index, pairs, chosen, options)),
+        doubts=(*doubts, *_change_doubts(chosen, lenses, lens)),
+    )
+    _check_changes(reader, chosen, lenses, times)
+    used = {"colour": chosen.colour, "right": chosen.right, "depth": chosen.depth,
+            "imu": None if imu is None else chosen.imu}  # fmt: skip
+    return Bag(
+        name=name,
+        camera=camera,
+        timestamps_s=reader.timestamps_s,
         truth=truth,
         truth_kind=truth_kind,
+        rows=tuple(range(len(pairs))),
+        read=reader.read,
         notes=(
             *_notes(chosen, formats, lens, options),
             *_pair_note(rectification),
@@ -306,35 +314,15 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
             *_registration_note(chosen, registration),
             truth_note,
             *_order_notes(index),
+            *facts.notes,
         ),
-        chosen=chosen,
+        has_depth=reader.has_depth,
+        has_stereo=rectification is not None,
         imu=imu,
-        log=DoubtLog(),
-        _file=file,
-        _stream=stream,
-        _pairs=tuple(pairs),
-        _colour_rectifier=_TopicRectifier(times, [map_to_pinhole(each, lens.camera) for each in lenses]),
-        _depth_rectifier=depth_rectifier,
-        _depth_scale=depth_scale,
-        _is_float_depth=is_float,
-        _registration=registration,
-        _rectification=rectification,
-        _no_depth=no_depth,
+        log=DoubtLog(check_source(facts)),
+        release=reader.close,
+        topics={name: topic.name for name, topic in used.items() if topic is not None},
     )
-    facts = SourceFacts(
-        name=name,
-        cameras=[CameraFacts(stated_by=_stated_by(chosen, options), lens=each) for each in lenses],
-        depth=_depth_facts(
-            bag, is_unit_stated=is_float or unit_m is not None or options.depth_scale is not None
-        ),
-        times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(bag.timestamps_s))],
-        losses=tuple(_loss_facts(index, pairs, chosen, options)),
-        doubts=(*doubts, *_change_doubts(chosen, lenses, lens)),
-    )
-    bag.notes += facts.notes
-    _check_changes(bag, lenses, times)
-    bag.log = DoubtLog(check_source(facts))
-    return bag
 
 
 _Pair = tuple[tuple[str, int, int], ...]
@@ -358,17 +346,17 @@ class _TopicRectifier:
         return self.rectifiers[self.times.row_at(stamp_ns, log_ns) if len(self.rectifiers) > 1 else 0]
 
 
-def _depth_facts(bag: Bag, *, is_unit_stated: bool) -> DepthFacts | None:
+def _depth_facts(reader: _BagReader, *, is_unit_stated: bool) -> DepthFacts | None:
     """Return the median depth of the first, middle and last frame with its unit; None without depth."""
-    if not bag.has_depth:
+    if not reader.has_depth:
         return None
-    rows = sorted({round(share * (len(bag) - 1)) for share in (0.0, 0.5, 1.0)})
+    rows = sorted({round(share * (len(reader.pairs) - 1)) for share in (0.0, 0.5, 1.0)})
     depths_m = []
     for row in rows:
         with contextlib.suppress(UsageError):  # an image that cannot be decoded is reported when it is used
-            depths_m.append(bag.read(row).depth_m)
+            depths_m.append(reader.read(row).depth_m)
     return DepthFacts(
-        median_m=median_depth_m(depths_m), units_per_m=bag._depth_scale, is_unit_stated=is_unit_stated
+        median_m=median_depth_m(depths_m), units_per_m=reader.depth_scale, is_unit_stated=is_unit_stated
     )
 
 
@@ -394,7 +382,9 @@ def _change_doubts(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> 
     return (Doubt(name=DoubtName.CAMERA_CHANGES, sentence=sentence, hint=hint),)
 
 
-def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None:
+def _check_changes(
+    reader: _BagReader, chosen: ChosenTopics, lenses: Sequence[Lens], times: CameraTimes
+) -> None:
     """Compare the images before and after the first five changes of the calibration in ``CameraInfo``.
 
     Raises:
@@ -402,12 +392,12 @@ def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None
     """
     if len(lenses) < 2:
         return
-    valid = [times.row_at(stamp_ns, log_ns) for (_, stamp_ns, log_ns), *_ in bag._pairs]
+    valid = [times.row_at(stamp_ns, log_ns) for (_, stamp_ns, log_ns), *_ in reader.pairs]
     changes = [row for row in range(1, len(valid)) if valid[row] != valid[row - 1]]
     for row in changes[:_MAX_CHECKED_CHANGES]:
         lens, other = lenses[valid[row - 1]], lenses[valid[row]]
         try:
-            images = [decode_colour(bag._file.parse(bag._stream.take(bag._pairs[each])[0]))
+            images = [decode_colour(reader.file.parse(reader.stream.take(reader.pairs[each])[0]))
                       for each in (row - 1, row)]  # fmt: skip
         except BrokenMessage:
             continue
@@ -416,9 +406,9 @@ def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None
             continue
         changed_px, unchanged_px = mismatches_px
         if changed_px > max(_MIN_MISMATCH_RATIO * unchanged_px, unchanged_px + _MIN_MISMATCH_PX):
-            topic = _stated_by(bag.chosen, BagOptions())
+            topic = _stated_by(chosen, BagOptions())
             raise UsageError(
-                f"{topic} states fx {lens.camera.fx:g} before {bag.timestamps_s[row]:.3f} s and "
+                f"{topic} states fx {lens.camera.fx:g} before {reader.timestamps_s[row]:.3f} s and "
                 f"fx {other.camera.fx:g} from then on, but the lens did not change: the images before and "
                 f"after miss by {changed_px:.0f} px with both cameras, and by {unchanged_px:.0f} px with one",
                 hint="give the calibration that is right: --intrinsics intrinsics.json",

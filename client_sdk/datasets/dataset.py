@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from client_sdk.auto_close import AutoClose
 from client_sdk.datasets.images import readable
 from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
@@ -22,7 +23,7 @@ __all__ = ["Dataset"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Dataset:
+class Dataset(AutoClose):
     """A recording: iterate over it for its frames in the order of time.
 
     Images are read during the iteration; a frame whose image cannot be read is left out, and counted in
@@ -45,6 +46,7 @@ class Dataset:
         thinned_to_hz: Frames per second on average that `thinned` has left; None for all frames.
         log: Collects the doubts about the recording; recordings that `thinned` and `share` return have the
             same log.
+        release: Closes the file of the recording; None if no file is open between two reads.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Dataset:
     imu: ImuTrack | None = None
     thinned_to_hz: float | None = None
     log: DoubtLog = field(default_factory=DoubtLog)
+    release: Callable[[], None] | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -96,6 +99,11 @@ class Dataset:
         if self.T_body_camera is not None:
             frames = (replace(frame, T_body_camera=self.T_body_camera) for frame in frames)
         return with_imu(frames, self.imu)
+
+    def close(self) -> None:
+        """Close the file of the recording, after which no frame can be read; may be called again."""
+        if self.release is not None:
+            self.release()
 
     def check(self) -> None:
         """Compare the images of some stereo pairs, and refuse a faulty rig; do nothing without stereo pairs.

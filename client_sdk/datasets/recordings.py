@@ -7,11 +7,12 @@ EuRoC and KITTI are read in `client_sdk.datasets.rig_recordings`, bags in `clien
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -44,10 +45,7 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, Lens
 from rse_pf.storage.files import check_exists, read_regular_file
 
-if TYPE_CHECKING:
-    from client_sdk.bags import Bag
-
-__all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
+__all__ = ["associate_stamps", "is_listed", "open_dataset"]
 
 _MAX_LIST_BYTES = 64 << 20  # a longer list of images is refused; this is enough for a million images
 _MAX_STAMP_DIFFERENCE_S = 0.02
@@ -112,12 +110,12 @@ def open_dataset(
     if scene is None and is_kitti(path):
         return open_kitti(path, camera=camera, imu=imu)
     if scene is None and _is_bag(path):
-        from client_sdk.bags import BagOptions, lens_or_rig, open_bag
-
+        bags = importlib.import_module("client_sdk.bags")  # an extension, which reads bags as data sets
         use_stereo = None if camera is None else camera == "stereo"
-        lens, rig = (None, None) if intrinsics is None else lens_or_rig(Path(intrinsics))
-        options = BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)
-        return dataset_of_bag(open_bag(path, options))
+        lens, rig = (None, None) if intrinsics is None else bags.lens_or_rig(Path(intrinsics))
+        options = bags.BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)
+        bag: Dataset = bags.open_bag(path, options)
+        return bag
     _check_calibration(path)
     dataset = _open_single(path, scene, None if intrinsics is None else Path(intrinsics))
     if camera == "stereo":
@@ -176,24 +174,6 @@ def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Data
     if not is_listed(path) and any(path.glob("d-*.pgm")):
         return _open_raw(path)
     return _open_tum(path, intrinsics)
-
-
-def dataset_of_bag(bag: Bag) -> Dataset:
-    """Return an open bag as a recording; its frames can be read only while the bag is open."""
-    return Dataset(
-        name=bag.name,
-        camera=bag.camera,
-        timestamps_s=bag.timestamps_s,
-        truth=bag.truth,
-        truth_kind=bag.truth_kind,
-        rows=tuple(range(len(bag))),
-        read=bag.read,
-        notes=bag.notes,
-        has_depth=bag.has_depth,
-        has_stereo=bag.has_stereo,
-        imu=bag.imu,
-        log=bag.log,
-    )
 
 
 def associate_stamps(

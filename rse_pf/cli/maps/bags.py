@@ -103,14 +103,11 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
     options = _options(request)
     from client_sdk.bags import open_bag
     from client_sdk.cameras import source_of_frames
-    from client_sdk.datasets.recordings import dataset_of_bag
 
     with at_work(f"reading {request.source}"):
         bag = open_bag(Path(request.source), options)
     show(*bag.notes)
-    frames = dataset_of_bag(bag)
-    if request.rate is not None:
-        frames = frames.thinned(request.rate)
+    frames = bag if request.rate is None else bag.thinned(request.rate)
     with source_of_frames(
         request.source,
         frames,
@@ -127,16 +124,7 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
             """Return the fields of the report about the bag, and the errors of *path*."""
             return {
                 "bag": request.source,
-                "topics": {
-                    name: topic.name
-                    for name, topic in (
-                        ("colour", bag.chosen.colour),
-                        ("right", bag.chosen.right),
-                        ("depth", bag.chosen.depth),
-                        ("imu", None if bag.imu is None else bag.chosen.imu),
-                    )
-                    if topic is not None
-                },
+                "topics": bag.topics,
                 "notes": list(bag.notes),
                 **errors_of(path, bag.truth, bag.truth_kind),
             }

@@ -156,7 +156,7 @@ def test_depth_is_taken_before_a_pair_unless_the_pair_is_wanted(tmp_path: Path) 
     with open_bag(path) as bag:
         assert (bag.has_depth, bag.has_stereo) == (True, False)
     with open_bag(path, BagOptions(right=RIGHT)) as bag:
-        assert (bag.has_depth, bag.has_stereo, bag.chosen.colour.name) == (False, True, LEFT)
+        assert (bag.has_depth, bag.has_stereo, bag.topics["colour"]) == (False, True, LEFT)
     assert open_dataset(path, camera="stereo").sensors == "stereo"
     with pytest.raises(UsageError, match="are not used together"):
         open_bag(path, BagOptions(right=RIGHT, depth=DEPTH))
@@ -169,8 +169,7 @@ def test_depth_is_taken_before_a_pair_unless_the_pair_is_wanted(tmp_path: Path) 
 )  # fmt: skip
 def test_names_of_drivers_tell_which_camera_is_the_left_one(tmp_path: Path, names: tuple[str, str]) -> None:
     with open_bag(write_bag(tmp_path, make=lambda w: pair_messages(w, left=names[0], right=names[1]))) as bag:
-        assert bag.chosen.right is not None
-        assert (bag.chosen.colour.name, bag.chosen.right.name) == names
+        assert (bag.topics["colour"], bag.topics["right"]) == names
 
 
 def test_of_several_pairs_the_user_names_one(tmp_path: Path) -> None:
@@ -184,7 +183,7 @@ def test_of_several_pairs_the_user_names_one(tmp_path: Path) -> None:
         open_bag(path)
     assert "--right TOPIC" in raised.value.hint
     with open_bag(path, BagOptions(right=others[1])) as bag:
-        assert bag.chosen.colour.name == others[0]
+        assert bag.topics["colour"] == others[0]
     with pytest.raises(UsageError, match="no pair of cameras, or several"):
         open_bag(path, BagOptions(use_stereo=True))
 
