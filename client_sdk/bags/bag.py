@@ -318,6 +318,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         ),
         has_depth=reader.has_depth,
         has_stereo=rectification is not None,
+        has_camera_truth=False,
         imu=imu,
         log=DoubtLog(check_source(facts)),
         release=reader.close,

@@ -4,7 +4,7 @@ Tracking and mapping of the frames belong to `client_sdk.mapper`, recordings of 
 `client_sdk.datasets`.
 """
 
-from client_sdk.cameras.open_camera import open_camera, source_of_frames
+from client_sdk.cameras.open_camera import open_camera, source_of_recording
 from client_sdk.cameras.source import FrameSource
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
@@ -19,7 +19,7 @@ __all__ = [
     "open_camera",
     "read_intrinsics",
     "read_rig",
-    "source_of_frames",
+    "source_of_recording",
     "write_intrinsics",
     "write_rig",
 ]

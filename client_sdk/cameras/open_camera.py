@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +21,10 @@ from client_sdk.cameras.source import (
     select_in_time,
     undistorted,
 )
-from client_sdk.datasets import CameraChoice, open_dataset
+from client_sdk.datasets import CameraChoice, Dataset, open_dataset
 from client_sdk.datasets.recordings import is_listed
 from client_sdk.datasets.rig_recordings import is_euroc, is_kitti
 from client_sdk.datasets.thinning import Thinning
-from client_sdk.frontend import Frame
 from client_sdk.rigs.folder_camera import OWN_FILE, find_folder_camera
 from client_sdk.rigs.intrinsics import Intrinsics, calibration_hint
 from client_sdk.rigs.rectification import Rectification
@@ -33,10 +32,9 @@ from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration, read_rig
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Camera
 from rse_pf.storage.files import check_exists
 
-__all__ = ["is_device", "is_recording", "open_camera", "source_of_frames"]
+__all__ = ["is_device", "is_recording", "open_camera", "source_of_recording"]
 
 _REALSENSE = "realsense"  # name of a source that is a device, and not a file
 _SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
@@ -142,16 +140,7 @@ def open_camera(
         dataset = open_dataset(path, camera=camera, imu=imu, intrinsics=intrinsics)
         dataset.check()
         dataset = dataset if rate_hz is None else dataset.thinned(rate_hz)
-        return source_of_frames(
-            word,
-            dataset,
-            dataset.camera,
-            has_depth=depth and dataset.has_depth,
-            has_stereo=dataset.has_stereo,
-            notes=dataset.notes,
-            log=dataset.log,
-            span_s=dataset.span_s,
-        )
+        return source_of_recording(word, dataset, depth=depth)
     # 4. With a rig of two cameras, refuse a folder, which has no two folders of images; open devices or
     #    videos.
     if isinstance(own, Rig) and path.is_dir():
@@ -271,37 +260,26 @@ def _facts_of_lens(name: str, lens: Intrinsics, stated_by: str) -> SourceFacts:
     return SourceFacts(name=name, cameras=(camera,))
 
 
-def source_of_frames(
-    name: str,
-    frames: Iterable[Frame],
-    camera: Camera,
-    *,
-    has_depth: bool,
-    has_stereo: bool = False,
-    close: Callable[[], None] | None = None,
-    notes: tuple[str, ...] = (),
-    log: DoubtLog | None = None,
-    span_s: tuple[float, float] | None = None,
-) -> FrameSource:
-    """Return a `FrameSource` of *frames* that are undistorted already, and whose depth is registered.
+def source_of_recording(name: str, recording: Dataset, *, depth: bool = True) -> FrameSource:
+    """Return the frames of a recording as a source, which closes the recording.
 
-    If *has_depth* is False, the depth image of each frame is replaced by an empty one.  *close* releases the
-    file of the frames.  All other arguments are attributes of `FrameSource`.  A frame that is not later than
-    the frame before is left out.
+    *name* is the recording in messages.  If *depth* is False, the depth image of each frame is replaced by an
+    empty one.  A frame that is not later than the frame before is left out.
     """
-    empty_depth = make_empty_depth(camera)
-    log = DoubtLog() if log is None else log
-    in_time = select_in_time(((frame.timestamp_s, frame) for frame in frames), name, log)
+    has_depth = depth and recording.has_depth
+    empty_depth = make_empty_depth(recording.camera)
+    in_time = select_in_time(((frame.timestamp_s, frame) for frame in recording), name, recording.log)
     return FrameSource(
         name=name,
-        camera=camera,
+        camera=recording.camera,
         frames=(frame if has_depth else replace(frame, depth_m=empty_depth) for _, frame in in_time),
         has_depth=has_depth,
-        has_stereo=has_stereo,
-        notes=notes,
-        log=log,
-        span_s=span_s,
-        release=close,
+        has_stereo=recording.has_stereo,
+        notes=recording.notes,
+        log=recording.log,
+        span_s=recording.span_s,
+        release=recording.close,
+        recording=recording,
     )
 
 

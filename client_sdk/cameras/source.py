@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.auto_close import AutoClose
+from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import map_to_pinhole
@@ -73,6 +74,7 @@ class FrameSource(AutoClose):
         log: The doubts about the source; reading may add some.
         span_s: First and last time stamp, s; None if they are not known before the frames are read.
         release: Releases the device or file; None if there is none.
+        recording: The recording of the frames; None for a device, a video or a folder of images.
     """
 
     name: str
@@ -84,6 +86,7 @@ class FrameSource(AutoClose):
     log: DoubtLog = field(default_factory=DoubtLog)
     span_s: tuple[float, float] | None = None
     release: Callable[[], None] | None = None
+    recording: Dataset | None = None
 
     def __iter__(self) -> FrameSource:
         """Return the source itself."""

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
+from client_sdk.datasets import Dataset
 from client_sdk.imu.checks import RateCheck, check_rates, find_sample_trouble
 from client_sdk.imu.history import ImuHistory
 from client_sdk.trajectory import Trajectory, read_odometry
@@ -97,17 +98,13 @@ class MotionReference:
     scale_deviation: float = 0.004
 
     @classmethod
-    def of_truth(
-        cls, path: Trajectory | None, kind: str, *, is_camera: bool = True
-    ) -> MotionReference | None:
-        """Return the ground truth of a recording as a reference; None if the truth has fewer than two poses.
-
-        *kind* says what the poses are: ``ground truth``, or another text for poses that are no ground truth.
-        """
-        if path is None or len(path) < 2:
+    def of_truth(cls, recording: Dataset) -> MotionReference | None:
+        """Return the truth of a recording as a reference; None if it has fewer than two poses."""
+        truth = recording.truth
+        if truth is None or len(truth) < 2:
             return None
-        name = "the truth" if kind == "ground truth" else "the reference poses"
-        return cls(path=path, name=name, is_camera=is_camera)
+        name = "the truth" if recording.truth_kind == "ground truth" else "the reference poses"
+        return cls(path=truth, name=name, is_camera=recording.has_camera_truth)
 
     @classmethod
     def of_folder(cls, source: Path | str) -> MotionReference | None:

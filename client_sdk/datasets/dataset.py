@@ -35,6 +35,7 @@ class Dataset(AutoClose):
         timestamps_s: Time stamps of the frames, s.
         truth: Trajectory of the camera with which an estimate can be compared; None if there is none.
         truth_kind: ``ground truth``, ``reference`` if *truth* is an estimate of another program, or ``none``.
+        has_camera_truth: Whether *truth* is certainly that of the camera, and not perhaps that of its body.
         rows: For each time stamp, the index of its frame, which is the argument of *read*.
         read: Reads the frame with an index; raises UnreadableImage if an image is damaged.
         notes: Sentences for the user on what was assumed because the recording does not state it.
@@ -60,6 +61,7 @@ class Dataset(AutoClose):
     has_depth: bool = True
     has_stereo: bool = False
     T_body_camera: Array | None = None
+    has_camera_truth: bool = True
     imu: ImuTrack | None = None
     thinned_to_hz: float | None = None
     log: DoubtLog = field(default_factory=DoubtLog)

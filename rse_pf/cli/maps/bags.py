@@ -6,13 +6,13 @@ camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rse_pf.cli.maps.from_camera import DriveRequest, check_drive, errors_of, map_source, truth_reference
+from rse_pf.cli.maps.from_camera import DriveRequest, check_drive, map_source
 from rse_pf.command_line.extras import require
 from rse_pf.command_line.options import option
 from rse_pf.config import PlatformSettings
@@ -21,7 +21,6 @@ from rse_pf.terminal import at_work, counted, show
 
 if TYPE_CHECKING:
     from client_sdk.bags import BagKind, BagOptions
-    from client_sdk.trajectory import Trajectory
 
 __all__ = ["FromBagRequest", "ToBagRequest", "run_from_bag", "run_to_bag"]
 
@@ -102,35 +101,16 @@ def run_from_bag(request: FromBagRequest, settings: PlatformSettings) -> int:
     scale = check_drive(request)
     options = _options(request)
     from client_sdk.bags import open_bag
-    from client_sdk.cameras import source_of_frames
+    from client_sdk.cameras import source_of_recording
 
     with at_work(f"reading {request.source}"):
         bag = open_bag(Path(request.source), options)
     show(*bag.notes)
     frames = bag if request.rate is None else bag.thinned(request.rate)
-    with source_of_frames(
-        request.source,
-        frames,
-        bag.camera,
-        has_depth=bag.has_depth,
-        has_stereo=bag.has_stereo,
-        close=bag.close,
-        log=frames.log,
-        span_s=frames.span_s,
-    ) as source:
+    about = {"bag": request.source, "topics": bag.topics, "notes": list(bag.notes)}
+    with source_of_recording(request.source, replace(frames, notes=())) as source:
         frames.check()
-
-        def about(path: Trajectory) -> dict[str, Any]:
-            """Return the fields of the report about the bag, and the errors of *path*."""
-            return {
-                "bag": request.source,
-                "topics": bag.topics,
-                "notes": list(bag.notes),
-                **errors_of(path, bag.truth, bag.truth_kind),
-            }
-
-        reference = truth_reference(request, bag.truth, bag.truth_kind, is_camera=False)
-        return map_source(request, settings, source, scale, about, reference)
+        return map_source(request, settings, source, scale, about=about)
 
 
 def run_to_bag(request: ToBagRequest, settings: PlatformSettings) -> int:

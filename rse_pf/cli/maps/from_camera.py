@@ -37,20 +37,15 @@ if TYPE_CHECKING:
     from client_sdk.cameras.source import FrameSource
     from client_sdk.check.drive_check import DriveCheck
     from client_sdk.check.motion import MotionReference
-    from client_sdk.datasets import Dataset
     from client_sdk.frontend import Frame
     from client_sdk.mapper import Mapper
-    from client_sdk.trajectory import Trajectory
-    from rse_pf.geometry import Array
 
 __all__ = [
     "DriveRequest",
     "FromCameraRequest",
     "check_drive",
-    "errors_of",
     "map_source",
     "run_from_camera",
-    "truth_reference",
 ]
 
 # Name of the robot in the map and its picture.
@@ -132,7 +127,6 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
     from client_sdk.cameras import open_camera
     from client_sdk.trajectory import read_odometry
 
-    recording = _recording(request)
     reference = None
     kind, _, scale_file = (request.scale or "").partition(":")
     odometries = [Path(scale_file)] if kind == "odometry" else []
@@ -145,15 +139,6 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
                 odometries.append(Path(request.source) / "odometry.txt")
         except UsageError as error:
             show(f"note: {error}: it is not compared with the motion", error=True)
-    if recording is not None:
-        reference = truth_reference(request, recording.truth, recording.truth_kind) or reference
-
-    def about(path: Trajectory) -> dict[str, Any]:
-        """Return the errors of *path* for the report; empty if the source states no true poses."""
-        if recording is None or recording.truth is None:
-            return {}
-        return errors_of(path, recording.truth, recording.truth_kind, recording.T_body_camera)
-
     with open_camera(
         request.source,
         intrinsics=request.intrinsics,
@@ -164,18 +149,7 @@ def run_from_camera(request: FromCameraRequest, settings: PlatformSettings) -> i
     ) as source:
         for file in odometries:
             source.log.add_reference(str(file), read_odometry(file).timestamps_s, source.span_s)
-        return map_source(request, settings, source, scale, about, reference)
-
-
-def _recording(request: FromCameraRequest) -> Dataset | None:
-    """Open the source as a recording, whose true poses are compared; None if it is a camera or a video."""
-    from client_sdk.cameras.open_camera import is_recording
-    from client_sdk.datasets import open_dataset
-
-    path = Path(request.source)
-    if not is_recording(path):
-        return None
-    return open_dataset(path, camera=request.camera, imu=request.imu, intrinsics=request.intrinsics)
+        return map_source(request, settings, source, scale, reference=reference)
 
 
 def _is_checked(request: DriveRequest) -> bool:
@@ -183,39 +157,13 @@ def _is_checked(request: DriveRequest) -> bool:
     return request.check and is_installed("client_sdk.check")
 
 
-def truth_reference(
-    request: DriveRequest, truth: Trajectory | None, kind: str, *, is_camera: bool = True
-) -> MotionReference | None:
-    """Return `MotionReference.of_truth` of the arguments; None if the drive is not checked."""
-    if not _is_checked(request):
-        return None
-    from client_sdk.check.motion import MotionReference
-
-    return MotionReference.of_truth(truth, kind, is_camera=is_camera)
-
-
-def errors_of(
-    path: Trajectory, truth: Trajectory | None, kind: str, T_body_camera: Array | None = None
-) -> dict[str, Any]:
-    """Return the errors of a trajectory for a report.
-
-    Args:
-        path: Estimated poses of the camera.
-        truth: True poses; None if there are none.
-        kind: What *truth* is, in words of the report.
-        T_body_camera: Maps camera to body; with it the poses of the body are compared.  None: of the camera.
-    """
-    from client_sdk.trajectory_error import trajectory_figures
-
-    return {"truth": kind, **trajectory_figures(path, truth, T_body_camera)}
-
-
 def map_source(
     request: DriveRequest,
     settings: PlatformSettings,
     source: FrameSource,
     scale: OdometryScale | MarkerScale | None,
-    about: Callable[[Trajectory], dict[str, Any]] | None = None,
+    *,
+    about: Mapping[str, Any] | None = None,
     reference: MotionReference | None = None,
 ) -> int:
     """Track the frames of *source*, write the results, and commit the map to the store; return 0.
@@ -225,8 +173,9 @@ def map_source(
         settings: Settings of the platform and the store.
         source: The frames, with what is known about their camera.
         scale: The source of metric scale for a camera without depth and stereo; None leaves it unknown.
-        about: Returns further fields of the report for the finished trajectory.
-        reference: A motion with which the tracked motion is compared; None compares nothing.
+        about: Further fields of the report.
+        reference: A motion with which the tracked motion is compared unless *source* is a recording with a
+            truth; None compares nothing then.
 
     Raises:
         UsageError: *scale* is given although the source has depth or stereo, or the source gives no frame.
@@ -239,6 +188,7 @@ def map_source(
             f"{request.source} has {what}, so that its scale is known",
             hint=f"leave out --scale, or add {option}",
         )
+    from client_sdk.trajectory_error import trajectory_figures
     from rse_pf.maps.map_image import RobotPath, draw_map
 
     _make_folder(request.out)
@@ -264,12 +214,19 @@ def map_source(
     if failed is not None:
         source.log.add(ended_early(failed, mapper.frames))
     doubts = unresolved(source.log.doubts, request.accept)
-    report = {**mapper.save(request.out), "assumed": list(source.notes)}
-    checked = None if check is None else check.finish(mapper, reference, doubts, request.accept)
-    if about is not None:
-        report = {**report, **about(mapper.trajectory)}
-    if report["unit"] != "m" and report.get("ate_cm") is not None:
-        report |= dict.fromkeys(("path_m", "ate_cm", "rpe_cm"))  # no metres without metric scale
+    report = {**mapper.save(request.out), "assumed": list(source.notes), **(about or {})}
+    recording = source.recording
+    checked = None
+    if check is not None:
+        from client_sdk.check.motion import MotionReference
+
+        truth = None if recording is None else MotionReference.of_truth(recording)
+        checked = check.finish(mapper, truth or reference, doubts, request.accept)
+    if recording is not None:
+        errors = trajectory_figures(mapper.trajectory, recording.truth, recording.T_body_camera)
+        if report["unit"] != "m":
+            errors |= dict.fromkeys(("path_m", "ate_cm", "rpe_cm"))  # no metres without metric scale
+        report |= {"truth": recording.truth_kind, **errors}
     if checked is not None:
         report["check"] = checked
     kept, kept_line = _keep(request, mapper, kept_in, images)

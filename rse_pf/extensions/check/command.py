@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from client_sdk.check.drive_check import check_lines
-from client_sdk.source_facts import DoubtLog, check_accepted, ended_early, unresolved
+from client_sdk.source_facts import check_accepted, ended_early, unresolved
 from rse_pf.command_line.extras import require
 from rse_pf.command_line.options import Action, option
 from rse_pf.command_line.sensors import AcceptRequest, SensorRequest, show_source
@@ -33,6 +33,7 @@ from rse_pf.terminal import show, show_json, show_progress
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from client_sdk.cameras import FrameSource
     from client_sdk.check.findings import CheckReport
     from client_sdk.check.motion import MotionReference
     from client_sdk.frontend import Frame
@@ -142,60 +143,31 @@ def _checked(
     A path that is no recording and no bag is opened as a camera, a video or a folder of images.
     """
     from client_sdk.bag_paths import is_bag
-    from client_sdk.cameras import open_camera
-    from client_sdk.cameras.open_camera import is_recording
+    from client_sdk.cameras import open_camera, source_of_recording
+    from client_sdk.cameras.open_camera import is_device, is_recording
     from client_sdk.check.motion import MotionReference
     from client_sdk.datasets import open_dataset
     from client_sdk.rigs.intrinsics import Intrinsics
+    from client_sdk.rigs.stereo_pair_checks import find_fault_of_frames
 
-    path = Path(request.source)
-    if not (path.exists() and (is_recording(path) or is_bag(path))):
-        reference = _reference(request, None)
-        with open_camera(
-            request.source,
-            intrinsics=request.intrinsics,
-            depth=not request.no_depth,
-            camera=request.camera,
-            imu=request.imu,
-        ) as source:
-            most = request.frames or (_MAX_DEVICE_FRAMES if str(request.source).isdigit() else None)
-            log = _compared(source.log, reference, source.span_s)
-            shown = show_source(source.notes, unresolved(log.doubts, request.accept))
-            report = _watched(
-                source, settings, reference, None, log, request.accept, has_depth=source.has_depth, most=most
-            )
-            return report, _base(request, Intrinsics(camera=source.camera)), shown
-    dataset = open_dataset(path, camera=request.camera, imu=request.imu, intrinsics=request.intrinsics)
-    fault: PairFault | None = None
-    if dataset.has_stereo:
-        from client_sdk.rigs.stereo_pair_checks import find_fault_of_frames
-
-        fault = find_fault_of_frames(dataset.sample_pairs())
-    truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
-    reference = _reference(request, truth)
-    log = dataset.log if reference is truth else _compared(dataset.log, reference, dataset.span_s)
-    shown = show_source(dataset.notes, unresolved(log.doubts, request.accept))
-    has_depth = dataset.has_depth and not request.no_depth
-    report = _watched(
-        iter(dataset),
-        settings,
-        reference,
-        fault,
-        log,
-        request.accept,
-        has_depth=has_depth,
-        most=request.frames,
-    )
-    return report, _base(request, Intrinsics(camera=dataset.camera)), shown
-
-
-def _compared(
-    log: DoubtLog, reference: MotionReference | None, span_s: tuple[float, float] | None
-) -> DoubtLog:
-    """Add a doubt to *log* if *reference* has no time stamp within the recording; return *log*."""
-    if reference is not None:
-        log.add_reference(f"the {reference.name}", reference.path.timestamps_s, span_s)
-    return log
+    path, has_depth = Path(request.source), not request.no_depth
+    fault = truth = None
+    if path.exists() and (is_recording(path) or is_bag(path)):
+        dataset = open_dataset(path, camera=request.camera, imu=request.imu, intrinsics=request.intrinsics)
+        fault = find_fault_of_frames(dataset.sample_pairs()) if dataset.has_stereo else None
+        truth = MotionReference.of_truth(dataset)
+        source = source_of_recording(request.source, dataset, depth=has_depth)
+    else:
+        source = open_camera(request.source, intrinsics=request.intrinsics, depth=has_depth,
+                             camera=request.camera, imu=request.imu)  # fmt: skip
+    with source:
+        reference = _reference(request, truth)
+        if reference is not None and reference is not truth:
+            source.log.add_reference(f"the {reference.name}", reference.path.timestamps_s, source.span_s)
+        shown = show_source(source.notes, unresolved(source.log.doubts, request.accept))
+        most = request.frames or (_MAX_DEVICE_FRAMES if is_device(request.source) else None)
+        report = _watched(source, settings, reference, fault, request.accept, most=most)
+        return report, _base(request, Intrinsics(camera=source.camera)), shown
 
 
 def _reference(request: CheckDriveRequest, truth: MotionReference | None) -> MotionReference | None:
@@ -211,14 +183,12 @@ def _reference(request: CheckDriveRequest, truth: MotionReference | None) -> Mot
 
 
 def _watched(
-    frames: Iterator[Frame],
+    source: FrameSource,
     settings: PlatformSettings,
     reference: MotionReference | None,
     fault: PairFault | None,
-    log: DoubtLog,
     accepted: Sequence[str],
     *,
-    has_depth: bool,
     most: int | None,
 ) -> CheckReport:
     """Track at most *most* frames (None for all) in this process, and return the result of their check.
@@ -232,10 +202,10 @@ def _watched(
 
     observer = DriveObserver(reference)
     observer.add_pairs(fault)
-    mapper = Mapper(ask=InProcessSolver(settings).ask, depth=has_depth, adds_frames=False)
+    mapper = Mapper(ask=InProcessSolver(settings).ask, depth=source.has_depth, adds_frames=False)
 
     async def drive() -> None:
-        for count, frame in enumerate(_until_it_fails(frames, log), 1):
+        for count, frame in enumerate(_until_it_fails(source), 1):
             observer.add(frame, await mapper.track(frame))
             if count % 10 == 0:
                 show_progress(f"{count} frames, {mapper.lost_frames} lost", is_over=False)
@@ -247,23 +217,23 @@ def _watched(
     if not mapper.frames:
         raise UsageError("the source gives no frame", hint="look at it: rse-pf camera check SOURCE")
     observer.add_offsets(mapper.adjust_pairs())
-    return observer.finish(unresolved(log.doubts, accepted), accepted)
+    return observer.finish(unresolved(source.log.doubts, accepted), accepted)
 
 
-def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:
-    """Yield *frames* until the source fails; add the failure to *log* as a doubt.
+def _until_it_fails(source: FrameSource) -> Iterator[Frame]:
+    """Yield the frames until the source fails; add the failure to its log as a doubt.
 
     An error before the first frame is raised.
     """
     count = 0
     try:
-        for frame in frames:
+        for frame in source:
             count += 1
             yield frame
     except RsePfError as error:
         if not count:
             raise
-        log.add(ended_early(error, count))
+        source.log.add(ended_early(error, count))
 
 
 def _base(request: CheckDriveRequest, seen: Intrinsics) -> Intrinsics:

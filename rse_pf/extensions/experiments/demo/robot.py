@@ -309,7 +309,7 @@ def _checked(
         return None
     from client_sdk.check.motion import MotionReference
 
-    reference = MotionReference.of_truth(recording.truth, recording.truth_kind, is_camera=False)
+    reference = MotionReference.of_truth(recording)
     tracked = mapper if isinstance(mapper, Mapper) else None
     return check.finish(tracked, reference, unresolved(recording.log.doubts, accepted), accepted)
 
