@@ -76,7 +76,7 @@ class Keypoints(NamedTuple):
     """Keypoints of one image, in the number types of OpenCV.
 
     Attributes:
-        pixels: ``(n, 2)`` float32, column and row in the whole image.
+        pixels: ``(n, 2)`` float32, column and row in the pyramid level times the size of the level.
         responses: ``(n,)`` float32, Harris corner measure.
         angles_deg: ``(n,)`` float32, orientation, clockwise from the x axis.
         octaves: ``(n,)`` int32, level of the pyramid, 0 for the finest.
@@ -147,12 +147,25 @@ def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = Tr
         )
     keypoints, descriptors = _describe(cv2, gray, keypoints)
     angles = np.radians(keypoints.angles_deg.astype(np.float64))
+    sizes = _LEVEL_SIZES[keypoints.octaves]
     return DescribedKeypoints(
-        pixels=keypoints.pixels.astype(np.float64),
+        pixels=(keypoints.pixels / sizes[:, None] + 0.5) * _pixels_per_level_pixel(gray, sizes) - 0.5,
         descriptors=descriptors,
         orientations=np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        sizes=_LEVEL_SIZES[keypoints.octaves],
+        sizes=sizes,
     )
+
+
+def _pixels_per_level_pixel(gray: npt.NDArray[np.uint8], sizes: Array) -> Array:
+    """Return the exact width and height ``(n, 2)`` of a pixel of the pyramid levels of *sizes* ``(n,)``.
+
+    A level has a whole number of pixels, and its corners are those of the image.  OpenCV neglects both where
+    it multiplies a column of a level by the level's size: its keypoints of coarse levels lie up to 1.3 px too
+    far to the upper left, and approaching a scene by 10 m then turns the camera by a degree.
+    """
+    extent = np.array(gray.shape[::-1], dtype=np.float64)
+    ratios: Array = extent / np.rint(extent / sizes[:, None])
+    return ratios
 
 
 def describe_at(
@@ -180,6 +193,8 @@ def describe_at(
     if not len(pixels):
         return nothing
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    sizes = _LEVEL_SIZES[levels]
+    pixels = ((pixels + 0.5) / _pixels_per_level_pixel(gray, sizes) - 0.5) * sizes[:, None]
     keypoints, descriptors = _describe_by_opencv(cv2, gray, pixels, angles_deg, levels)
     if not keypoints:
         return nothing

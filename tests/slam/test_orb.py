@@ -111,6 +111,27 @@ def test_keypoints_too_near_to_the_edge_are_not_described(x: float, y: float) ->
     assert describe_keypoints(np.zeros((1, 1), np.uint8), inside) is None
 
 
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (240, 320), (300, 417)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_features_of_a_mirrored_image_are_at_the_mirrored_pixels(
+    height: int, width: int, axis: int
+) -> None:
+    rgb = np.repeat(picture(3, height, width)[..., None], 3, axis=2)
+    found = describe_orb(rgb, 2000, is_spread=False)
+
+    mirrored = describe_orb(np.flip(rgb, axis), 2000, is_spread=False)
+
+    expected = mirrored.pixels.copy()
+    expected[:, 1 - axis] = (height, width)[axis] - 1 - expected[:, 1 - axis]
+    for size in np.unique(found.sizes):
+        ours, theirs = found.pixels[found.sizes == size], expected[mirrored.sizes == size]
+        offsets = ours[:, None] - theirs
+        nearest = np.linalg.norm(offsets, axis=2).argmin(axis=1)
+        offset = offsets[np.arange(len(ours)), nearest, 1 - axis]
+        assert len(ours) > 10
+        assert abs(float(np.median(offset))) < 0.05
+
+
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["7scenes_redkitchen", "nyu_dining_room", "tum_fr1_xyz_start"])
 def test_the_features_of_a_recording_are_those_of_opencv(recordings: Path, name: str) -> None:
