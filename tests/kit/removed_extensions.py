@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+
 import pytest
 
 from rse_pf.command_line.extras import is_installed
 
-__all__ = ["is_removed", "skip_if_removed"]
+__all__ = ["installed_commands", "is_removed", "skip_if_removed"]
 
 _EXPERIMENTS = "rse_pf.extensions.experiments"
 _PACKAGES = {
@@ -33,6 +36,15 @@ def is_removed(command: str) -> bool:
     words = command.split()
     needed = [_PACKAGES.get(" ".join(words[:count])) for count in (1, 2)]
     return any(package is not None and not is_installed(package) for package in needed)
+
+
+def installed_commands(commands: Sequence[str]) -> list[str]:
+    """Return *commands*, which begin with ``rse-pf``, but print those that need a removed extension."""
+    left_out = [command for command in commands if is_removed(command.removeprefix("rse-pf "))]
+    for command in left_out:
+        # The stream of the process: the `capsys` of a test would read what is written to `sys.stderr`.
+        print(f"not run, because its extension was removed: {command}", file=sys.__stderr__)
+    return [command for command in commands if command not in left_out]
 
 
 def skip_if_removed(command: str) -> None:
