@@ -35,7 +35,8 @@ class Dataset(AutoClose):
         timestamps_s: Time stamps of the frames, s.
         truth: Trajectory of the camera with which an estimate can be compared; None if there is none.
         truth_kind: ``ground truth``, ``reference`` if *truth* is an estimate of another program, or ``none``.
-        has_camera_truth: Whether *truth* is certainly that of the camera, and not perhaps that of its body.
+        has_camera_truth: False where nothing states that *truth* is that of the camera, as in a bag, whose
+            poses may be those of a body.
         rows: For each time stamp, the index of its frame, which is the argument of *read*.
         read: Reads the frame with an index; raises UnreadableImage if an image is damaged.
         notes: Sentences for the user on what was assumed because the recording does not state it.
