@@ -23,6 +23,7 @@ from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.cli.main import main
 from rse_pf.cli.maps import from_camera
+from rse_pf.command_line.extras import is_installed
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from rse_pf.storage.object_store import DirectoryStore
 from rse_pf.storage.quotas import set_own_quota
@@ -30,6 +31,8 @@ from tests.kit.flat_world import CAMERA, STEP_M, frame_at
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 from tests.kit.tum_recording import write_tum  # noqa: E402
+
+needs_check = pytest.mark.skipif(not is_installed("client_sdk.check"), reason="client_sdk.check was removed")
 
 
 class SolvingRobot:
@@ -125,6 +128,7 @@ def test_a_recording_with_true_poses_tells_the_error_of_the_path(
     assert f"error beside the ground truth: ATE {report['ate_cm']:.2f} cm" in out
 
 
+@needs_check
 def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = Trajectory(np.arange(6) * 0.1, np.tile(np.eye(4), (6, 1, 1)))
     write_tum(folder / "drive", [frame_at(row, depth=True) for row in range(6)], truth)
@@ -157,6 +161,7 @@ def test_a_map_above_the_quota_of_its_tenant_is_not_kept_and_the_drive_is(
 RNG = np.random.default_rng(3)
 
 
+@needs_check
 @pytest.mark.parametrize(
     ("seen", "hint"),
     [
