@@ -23,9 +23,9 @@ class Ros2(RosPrograms):
     shell = "ros2"
     listener_file = "ros2_listener.py"
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, domain: int = DOMAIN) -> None:
         env = {
-            "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "FASTDDS_DEFAULT_PROFILES_FILE": str(_PROFILE),
             "ROS_HOME": str(folder), "PYTHONUNBUFFERED": "1",
         }  # fmt: skip
