@@ -54,7 +54,10 @@ from client_sdk.tracking.segment_join import (
     REPEATED,
     Join,
     JoinCandidate,
+    WheelConnection,
     carried_segment_after,
+    connections_between,
+    is_join_expected,
     root_of,
     without_segment,
 )
@@ -223,6 +226,9 @@ class Tracker:
         self._next_segment = 0
         self._anchors: dict[int, int] = {}
         """The segment in whose world a segment began, because the wheels had carried the pose."""
+        self._connections: dict[int, tuple[WheelConnection, ...]] = {}
+        """Motions by wheels between the world of a segment and that of its anchor: several once a segment
+        between them was joined."""
         self._has_pose = False
         self._has_missing_answer = False
         self._adjusted_frames = 0
@@ -283,6 +289,7 @@ class Tracker:
         self._T_world_start = T_world_start
         self._segments.clear()
         self._anchors.clear()
+        self._connections.clear()
         self._next_segment = 0
         self._has_pose = timestamp_s is not None
         self._state = _TrackState(
@@ -302,6 +309,8 @@ class Tracker:
         self._T_world_start = orthonormalise(T_new_old @ self._T_world_start)
         for segment_map in self._segments.values():
             segment_map.move(T_new_old)
+        for number, connections in self._connections.items():
+            self._connections[number] = tuple(each.moved(T_new_old) for each in connections)
         self._move_state(T_new_old)
 
     def adjust_pairs(self) -> dict[int, StereoAdjustment]:
@@ -838,20 +847,22 @@ class Tracker:
                 return self._lose(match_count)
         is_continued = bool(self._segments) or motion is not None
         start = T_carried if is_continued else self._T_world_start
-        return self._begin_segment(view, start, feature_count, is_carried=motion is not None)
+        return self._begin_segment(view, start, feature_count, motion)
 
     def _begin_segment(
-        self, view: View, T_world_camera: Array, feature_count: int, *, is_carried: bool
+        self, view: View, T_world_camera: Array, feature_count: int, motion: WheelMotion | None
     ) -> TrackedFrame:
         """Begin a segment with a frame at a pose; it is the present segment from now on.
 
-        *feature_count* is the number of features with depth, *is_carried* whether the wheels have carried the
-        pose from the segment before.  Returned is the result of the frame.
+        *feature_count* is the number of features with depth, *motion* that by which the wheels have carried
+        the pose from the segment before, if they have.  Returned is the result of the frame.
         """
         segment, timestamp_s = self._next_segment, self._frame.timestamp_s
         self._next_segment += 1
-        if is_carried and self._segments:
+        if motion is not None and self._segments:
             self._anchors[segment] = self._state.segment
+            connection = WheelConnection(position=T_world_camera[:3, 3], motion=motion)
+            self._connections[segment] = (connection,)
         self._has_pose = True
         self._segments[segment] = KeyframeMap(self.options.max_keyframes)
         self._state = _TrackState(T_world_camera=T_world_camera, timestamp_s=timestamp_s, segment=segment)
@@ -917,7 +928,7 @@ class Tracker:
         """Ask for the place of a tracked frame in other segments; join two once two measurements agree.
 
         Two measurements are compared if they are of the same other segment and no measurement lies between
-        them.
+        them.  An answer need not be clear if wheels connect both segments and allow the measurement.
         """
         # 1. Solve and verify the pose against the keyframe of another segment with the most matches.
         view, present = posed.view, self._state.segment
@@ -927,14 +938,18 @@ class Tracker:
             return
         attempt = self._attempt_at(best, "segment")
         T_other_camera, answer = yield from self._solve(view, attempt)
-        if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
+        if T_other_camera is None:
             return
-        there = self._verify(view, T_other_camera, attempt, answer)
-        if there is None:
+        here = posed.T_world_camera[:3, 3]
+        is_clear = answer.is_clear(min(count, self._max_matches))
+        T_other_present = T_other_camera @ inverse(posed.T_world_camera)
+        is_expected = self._is_join_expected(best.segment, T_other_present, here)
+        there = self._verify(view, T_other_camera, attempt, answer) if is_clear or is_expected else None
+        if there is None or not (is_clear or there.inliers >= CLEAR_INLIERS):
             return
         # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
         T_other_present = orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
-        here, previous = posed.T_world_camera[:3, 3], self._state.join_candidate
+        previous = self._state.join_candidate
         is_confirmed = previous is not None and previous.agrees_with(best.segment, T_other_present)
         first_position = previous.first_position if previous is not None and is_confirmed else here
         candidate = JoinCandidate(
@@ -947,7 +962,7 @@ class Tracker:
         #    such places do not overlap: wait until the camera has moved farther than they can be apart.
         reach, begin = self._reach_of_join(best.segment, T_other_present)
         distance_m = attempt.distance_to(there.T_world_camera[:3, 3])
-        is_reached = reach.excess(begin) <= REACH_DEPTH_SHARE * distance_m
+        is_reached = is_expected or reach.excess(begin) <= REACH_DEPTH_SHARE * distance_m
         if not is_reached and np.linalg.norm(here - first_position) < reach.farthest(begin):
             return
         # 4. Move the newer of the two segments into the older one, whose poses stay as they are.
@@ -955,6 +970,18 @@ class Tracker:
             self._join(present, best.segment, T_other_present)
         else:
             self._join(best.segment, present, inverse(T_other_present))
+
+    def _is_join_expected(self, other: int, T_other_present: Array, here: Array) -> bool:
+        """Return whether wheels connect two segments, and allow a measurement of one in the other.
+
+        The arguments are those of `is_join_expected`; *other* is the number of the other segment.
+        """
+        present = self._state.segment
+        if root_of(self._anchors, other) != root_of(self._anchors, present):
+            return False
+        on_way = connections_between(self._anchors, other, present)
+        connections = chain.from_iterable(self._connections[number] for number in on_way)
+        return is_join_expected(connections, T_other_present, here)
 
     def _reach_of_join(self, other: int, T_other_present: Array) -> tuple[Reach, Array]:
         """Return where the newer of two segments can begin in the older one, and where it would by a join.
@@ -975,6 +1002,10 @@ class Tracker:
         segment_map.move(T_into_segment)
         first_landmark = self._segments[into].append(segment_map)
         self.joins.append(Join(segment, into, T_into_segment))
+        own = self._connections.pop(segment, ())
+        for number, anchor in self._anchors.items():
+            if anchor == segment:
+                self._connections[number] += own
         self._anchors = without_segment(self._anchors, segment)
         if segment == self._state.segment and self._state.last is not None:
             self._state = replace(self._state, segment=into)
