@@ -126,6 +126,22 @@ def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
     assert "depth scale is set" in capsys.readouterr().out
 
 
+def test_without_depth_nothing_is_said_about_the_depth_of_a_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("cv2")
+    from client_sdk.simulator import render_frames, true_trajectory
+    from tests.kit.tum_recording import write_tum
+
+    write_tum(tmp_path, render_frames(0, 1, 12, 3), true_trajectory(0, 1, 12, 3), depth_scale=1100)
+
+    main(["check", str(tmp_path), "--no-depth", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    said = {each["kind"] for each in (*report["findings"], *report["cannot_tell"])}
+    assert said
+    assert not any(kind.startswith("depth") for kind in said)
+
+
 def test_nothing_is_advised_while_the_source_has_a_finding(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
