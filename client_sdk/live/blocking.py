@@ -10,6 +10,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live.alignments import Correction
 from client_sdk.live.live_mapper import LiveMapper
 from client_sdk.wheel_odometry import OdometryReading
+from rse_pf.slam.occupancy import GridOptions, OccupancyGrid
 
 __all__ = ["BlockingLiveMapper"]
 
@@ -42,6 +43,11 @@ class BlockingLiveMapper:
         """Return the pose of the next frame; see `LiveMapper.track`."""
         tracked: TrackedFrame = self._wait(self.mapper.track(frame, odometry=odometry))
         return tracked
+
+    def floor_plan(self, options: GridOptions | None = None, *, max_age_s: float = 0.0) -> OccupancyGrid:
+        """Return the floor plan of the whole map; see `LiveMapper.floor_plan`."""
+        plan: OccupancyGrid = self._wait(self.mapper.floor_plan(options, max_age_s=max_age_s))
+        return plan
 
     def corrections(self) -> Iterator[Correction]:
         """Yield each change of an alignment, and block until the next; see `LiveMapper.corrections`."""

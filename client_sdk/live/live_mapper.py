@@ -37,6 +37,7 @@ from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live.alignments import Alignments, Correction, CorrectionStream, OtherRobot
 from client_sdk.live.attachments import Attachments, EncodedAttachments, StoreObject
+from client_sdk.live.floor_plans import FloorPlans
 from client_sdk.live.keyframe_encoding import encode_depth_keyframe, encode_monocular_keyframe
 from client_sdk.live.keyframe_queue import KeyframeQueue, NumberOffset, QueuedKeyframe
 from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, KeyframeSent, LiveRobot, MapShown
@@ -55,6 +56,7 @@ from client_sdk.trajectory import Trajectory
 from client_sdk.wheel_odometry import OdometryReading
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
+from rse_pf.slam.occupancy import GridOptions, OccupancyGrid
 from rse_pf.wire.live_map import live_topic
 
 __all__ = ["LiveMapper"]
@@ -161,6 +163,7 @@ class LiveMapper:
             clock,
             on_reply=lambda *reply: self._publish(self._alignments.apply_relocalisation(*reply)),
         )
+        self._floor_plans = FloorPlans(robot, name, deadline_s=self.options.deadline_s, clock=clock)
         self._mapper = Mapper(
             ask=self._ask_with_priority,
             camera=camera,
@@ -433,6 +436,28 @@ class LiveMapper:
         robot has sent in this run.
         """
         self._relocaliser.skip_pause()
+
+    async def floor_plan(
+        self, options: GridOptions | None = None, *, max_age_s: float = 0.0
+    ) -> OccupancyGrid:
+        """Return the floor plan of the whole map: what the keyframes of all its robots have seen.
+
+        The map server makes it, about 0.4 s for 1,200 keyframes.  The robot receives only the cells that have
+        changed since its last call, less than 20 kB/s: a call waits until this rate allows it.  If the plan
+        has not changed, the same object is returned.
+
+        Args:
+            options: Size of the cells, heights of robot and floor, and the direction up.  None for *up*: the
+                z axis of the map, which is right if its first robot had a base or an IMU.
+            max_age_s: How old a plan may be to which only keyframes were added since; after a correction of
+                half a cell a new one is made in any case.
+
+        Raises:
+            NotFound: The map shows no floor yet, or its z axis does not point up.
+            BadRequest, LimitExceeded: An option is out of its range, or the plan is too large for a message.
+            RsePfError: The platform does not answer, or has no floor plans.
+        """
+        return await self._floor_plans.newest(options or GridOptions(), max_age_s)
 
     @property
     def map(self) -> PointMap:

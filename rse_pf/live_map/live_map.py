@@ -68,9 +68,11 @@ from rse_pf.live_map.snapshots import (
     encode_graph,
 )
 from rse_pf.live_map.versions import (
+    PlacedKeyframes,
     PointSource,
     image_references,
     paths_of,
+    placed_keyframes,
     point_sources,
     version_of,
     whole_graph,
@@ -253,6 +255,10 @@ class LiveMap:
     def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
         """Return where the metric point clouds of *version*, which `to_version` just returned, are stored."""
         return point_sources(self._graph, version)
+
+    def placed_keyframes(self) -> PlacedKeyframes:
+        """Return the metric keyframes with features in the map, with their present poses."""
+        return placed_keyframes(self._graph)
 
     def image_references(self, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:
         """Return the field ``images`` of the provenance of *version*: digests by robot and id of keyframe."""

@@ -9,6 +9,7 @@ height from one step below the floor to the height of the robot.  All other cell
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,11 +23,13 @@ from rse_pf.slam.level_surfaces import UpSource, estimate_up
 
 __all__ = [
     "FREE",
+    "MAX_CELLS",
     "MAX_LINES_OF_SIGHT",
     "OCCUPIED",
     "UNKNOWN",
     "GridOptions",
     "OccupancyGrid",
+    "grid_of_points",
     "make_occupancy_grid",
 ]
 
@@ -34,7 +37,7 @@ OCCUPIED = 0  # grey level of a cell with an obstacle: black
 UNKNOWN = 205  # grey level of a cell that no camera has observed, as map_saver of ROS writes it
 FREE = 254  # grey level of a cell without an obstacle: white, as map_saver of ROS writes it
 
-_MAX_CELLS = 1 << 24  # largest number of cells of an occupancy grid: 16 MiB of memory
+MAX_CELLS = 1 << 24  # largest number of cells of an occupancy grid: 16 MiB of memory
 _MAX_DISTANCE_M = 30.0
 """Largest distance in metres of a point from the box around all camera positions, along each axis of the
 grid; points beyond are left out of the floor plan, because no camera can have seen them."""
@@ -154,16 +157,52 @@ def make_occupancy_grid(
         raise UsageError("a map without keyframes has no floor plan", hint="export its cloud as ply")
     if not len(version.points):
         raise UsageError("this map has no points, so it has no floor plan", hint="export it as tum or g2o")
-    # 1. Rotate the map so that its z axis points up.
     up, up_source = _find_up(version, options)
+    return grid_of_points(
+        version.points,
+        np.array([keyframe.T_world_camera for keyframe in version.keyframes]),
+        [keyframe.points_camera for keyframe in version.keyframes],
+        up,
+        options,
+        up_source=up_source,
+        max_lines=max_lines,
+    )
+
+
+def grid_of_points(
+    points_world: npt.NDArray[np.float32],
+    T_world_camera: Array,
+    sights_camera: Sequence[npt.NDArray[np.float32]],
+    up: Array,
+    options: GridOptions,
+    *,
+    up_source: UpSource,
+    max_lines: int,
+) -> OccupancyGrid:
+    """Return the floor plan of a cloud and of the cameras that have seen it.
+
+    Args:
+        points_world: ``(m, 3)`` metres, m >= 1.
+        T_world_camera: ``(k, 4, 4)``, k >= 1.
+        sights_camera: For each camera ``(n, 3)`` points that it has seen, in its own frame, metres or NaN.
+        up: ``(3,)``, unit vector against gravity in the world.
+        options: Size of the cells, and heights of floor and robot; its ``up`` is not used.
+        up_source: Where *up* comes from.
+        max_lines: Largest number of lines of sight that mark cells as free.
+
+    Raises:
+        UsageError: No point is near the cameras, nothing is seen between the floor and the height of the
+            robot, or the grid would have more than 2**24 cells.
+    """
+    # 1. Rotate the map so that its z axis points up.
     T_grid_world = upright_rotation(-up)
-    T_grid_camera = np.array([T_grid_world @ keyframe.T_world_camera for keyframe in version.keyframes])
+    T_grid_camera = T_grid_world @ T_world_camera
     # 2. Leave out points that no camera can have seen: those far outside the box around the cameras.  Refuse
     # a grid that would be too large for the cameras alone before the points are transformed.
     low = T_grid_camera[:, :3, 3].min(axis=0)
     high = T_grid_camera[:, :3, 3].max(axis=0)
     _check_cell_count(high - low, options)
-    points = transform(T_grid_world, version.points.astype(np.float64))
+    points = transform(T_grid_world, points_world.astype(np.float64))
     is_near = ((points >= low - _MAX_DISTANCE_M) & (points <= high + _MAX_DISTANCE_M)).all(axis=1)
     points_left_out = len(points) - int(is_near.sum())
     points = points[is_near]
@@ -178,7 +217,7 @@ def make_occupancy_grid(
     floor_points = points[np.abs(height_m) <= options.step_m]
     # 4. Mark the cells of floor points and lines of sight as free, then those of obstacles as occupied, which
     # replaces free.
-    start, end = _lines_of_sight(version, T_grid_camera, floor_m, options, max_lines)
+    start, end = _lines_of_sight(sights_camera, T_grid_camera, floor_m, options, max_lines)
     raster = _Raster.covering([obstacles, floor_points, start, end], options)
     raster.mark_free(raster.cell_numbers(floor_points))
     raster.mark_lines_free(start, end)
@@ -213,15 +252,15 @@ def _check_cell_count(extent_m: Array, options: GridOptions) -> None:
     """
     sides = np.ceil(extent_m[:2] / options.resolution_m) + 1.0
     cells = float(sides[0] * sides[1])
-    if cells > _MAX_CELLS:
-        min_resolution_m = options.resolution_m * math.sqrt(cells / _MAX_CELLS) * 1.1
+    if cells > MAX_CELLS:
+        min_resolution_m = options.resolution_m * math.sqrt(cells / MAX_CELLS) * 1.1
         hint = (
             f"raise --resolution to {min_resolution_m:.2g} m"
             if min_resolution_m < 10.0
             else "check the poses of the map"
         )
         raise UsageError(
-            f"a grid over {extent_m[0]:.4g} x {extent_m[1]:.4g} m has {cells:.3g} cells, above {_MAX_CELLS}",
+            f"a grid over {extent_m[0]:.4g} x {extent_m[1]:.4g} m has {cells:.3g} cells, above {MAX_CELLS}",
             hint=hint,
         )
 
@@ -255,7 +294,11 @@ def _find_floor(points: Array, T_grid_camera: Array, options: GridOptions) -> fl
 
 
 def _lines_of_sight(
-    version: MapVersion, T_grid_camera: Array, floor_m: float, options: GridOptions, max_lines: int
+    sights_camera: Sequence[npt.NDArray[np.float32]],
+    T_grid_camera: Array,
+    floor_m: float,
+    options: GridOptions,
+    max_lines: int,
 ) -> tuple[Array, Array]:
     """Return starts and ends ``(n, 3)`` in metres of the lines from cameras to features, in the grid's frame.
 
@@ -267,8 +310,8 @@ def _lines_of_sight(
     max_per_keyframe = max(1, max_lines // len(T_grid_camera))
     # 1. Take the lines from each keyframe to those of its features that lie in front of the camera, not
     # farther than `_MAX_RAY_M` along any axis; thin them evenly to the share of a keyframe.
-    for keyframe, T in zip(version.keyframes, T_grid_camera, strict=True):
-        points = keyframe.points_camera.astype(np.float64)
+    for seen, T in zip(sights_camera, T_grid_camera, strict=True):
+        points = seen.astype(np.float64)
         points = points[(np.abs(points) <= _MAX_RAY_M).all(axis=1) & (points[:, 2] > 0.0)]
         points = points[:: max(1, math.ceil(len(points) / max_per_keyframe))]
         ends.append(transform(T, points))

@@ -16,6 +16,7 @@ from rse_pf.errors import BadRequest
 from rse_pf.wire.arrays import Array
 
 __all__ = [
+    "FLOOR_PLAN",
     "FORGET",
     "KEYFRAME",
     "LEAVE",
@@ -27,8 +28,10 @@ __all__ = [
     "START",
     "STOP",
     "AlignmentUpdate",
+    "FloorPlanReply",
     "KeyframeKept",
     "KeyframeRequest",
+    "LiveFloorPlan",
     "LiveForget",
     "LiveMapRequest",
     "LiveRelocalise",
@@ -126,6 +129,43 @@ class RelocaliseReply(_Value, frozen=True, kw_only=True):
     scale: float | None = None
 
 
+class LiveFloorPlan(LiveMapRequest, frozen=True, kw_only=True):
+    """Request of ``live-floor-plan``: which cells of the map are occupied, free or unknown.
+
+    The numbers are those of `rse_pf.slam.occupancy.GridOptions`, in metres; ``up`` is absent if the z axis of
+    the map points up.  ``known`` is the id of the newest plan that the robot has.  ``max_age_s`` is how old,
+    in seconds, a plan may be to which only keyframes were added since; a correction makes a new one at once.
+    """
+
+    known: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    max_age_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+    resolution_m: float = 0.05
+    robot_height_m: float = 1.5
+    step_m: float = 0.1
+    floor_m: float | None = None
+    up: tuple[float, float, float] | None = None
+
+
+class FloorPlanReply(_Value, frozen=True, kw_only=True):
+    """Reply of ``live-floor-plan``: the fields of `rse_pf.slam.occupancy.OccupancyGrid`.
+
+    ``plan`` is the id of the plan, and ``version`` the newest position in the map's log that it contains.
+    ``cells`` is what `rse_pf.slam.floor_plan_change.encode_change` returned for the plan ``base`` and this
+    plan; ``base`` is empty, or the plan that the robot knows.  ``cells`` is empty if it knows this plan.
+    """
+
+    plan: str
+    version: int
+    base: str = ""
+    cells: bytes = b""
+    rows: int = 0
+    columns: int = 0
+    origin_m: tuple[float, float] = (0.0, 0.0)
+    floor_m: float = 0.0
+    T_grid_map: Array | None = None
+    points_left_out: int = 0
+
+
 class LiveForget(_Value, frozen=True, kw_only=True):
     """Request of ``live-forget``: remove from the map everything that ``robot`` has contributed to it."""
 
@@ -156,11 +196,12 @@ class LiveStart(_Value, frozen=True, kw_only=True):
         return (self.map, name or "head") if _VERSION.fullmatch(name) else (name, "head")
 
 
-LiveRequest = KeyframeRequest | LiveRelocalise | LiveMapRequest | LiveForget | LiveStart
+LiveRequest = KeyframeRequest | LiveRelocalise | LiveFloorPlan | LiveMapRequest | LiveForget | LiveStart
 """A request that the map server of a live map answers."""
 # Names of the services of live maps.
 KEYFRAME = "live-keyframe"  # a robot adds a keyframe
 RELOCALISE = "live-relocalise"  # a robot asks for the pose of a keyframe in the map
+FLOOR_PLAN = "live-floor-plan"  # a robot asks which cells are occupied or free
 LEAVE = "live-leave"  # a robot leaves the map
 SHOW = "live-show"  # returns the state of the map
 PUBLISH = "live-publish"  # stores a version of the map
@@ -170,6 +211,7 @@ START = "live-start"  # begins a map
 LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
     KEYFRAME: KeyframeRequest,
     RELOCALISE: LiveRelocalise,
+    FLOOR_PLAN: LiveFloorPlan,
     LEAVE: LiveMapRequest,
     SHOW: LiveShow,
     PUBLISH: LiveMapRequest,

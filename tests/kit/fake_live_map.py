@@ -15,7 +15,7 @@ from rse_pf.errors import Conflict, Expired, NotFound, RsePfError
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.wire import as_type
-from rse_pf.wire.live_map import KeyframeRequest, LiveRelocalise
+from rse_pf.wire.live_map import KeyframeRequest, LiveFloorPlan, LiveRelocalise
 
 __all__ = ["FakeLiveRobot", "alignment", "solve", "solved"]
 
@@ -67,6 +67,9 @@ class FakeLiveRobot:
         self.lose_answer = False
         self.asked: list[str] = []
         self.relocalised: dict[str, Any] = {"verdict": "none", "reason": "nothing alike"}
+        self.plans: list[dict[str, Any]] = []
+        """The replies to requests for the floor plan, in their order; the last one is repeated."""
+        self.known_plans: list[str] = []
         self.foreign_keyframes = 0
         self.has_images = False
         self.changed = asyncio.Event()
@@ -83,7 +86,7 @@ class FakeLiveRobot:
             if not self.connected:
                 raise Expired("no server")
             self.before_answer(service)
-            reply = getattr(self, "_" + service.partition("-")[2])(request)
+            reply = getattr(self, "_" + service.partition("-")[2].replace("-", "_"))(request)
         finally:
             self.changed.set()
         if self.lose_answer:
@@ -146,6 +149,10 @@ class FakeLiveRobot:
     def _relocalise(self, request: Any) -> Any:
         as_type(msgspec.to_builtins(request, builtin_types=(bytes,)), LiveRelocalise)
         return self.relocalised
+
+    def _floor_plan(self, request: LiveFloorPlan) -> Any:
+        self.known_plans.append(request.known)
+        return self.plans.pop(0) if len(self.plans) > 1 else self.plans[0]
 
     def _leave(self, request: Any) -> Any:
         return {}

@@ -83,7 +83,7 @@ class InlineThreads:
     async def store(self, act: Callable[[], _T]) -> _T:
         return act()
 
-    match = lease = background = store
+    match = lease = background = plan = store
 
 
 class FailingStore(FakeStore):

@@ -72,12 +72,13 @@ class MapServerThreads:
     """The threads in which a map server computes and waits for the object store.
 
     Every thread does one thing at a time.  There is one thread for the map, one for the log, one for the
-    lease, one for background work, and three for `match`.  They end with the process.
+    lease, one for floor plans, one for background work, and three for `match`.  They end with the process.
     """
 
     def __init__(self) -> None:
         self._log = ThreadPoolExecutor(1, thread_name_prefix="store")
         self._lease = ThreadPoolExecutor(1, thread_name_prefix="lease")
+        self._plan = ThreadPoolExecutor(1, thread_name_prefix="plan")
         self._background = ThreadPoolExecutor(
             1, thread_name_prefix="background", initializer=_lower_thread_priority
         )
@@ -120,6 +121,13 @@ class MapServerThreads:
     def lease(self, act: Callable[[], _T]) -> Awaitable[_T]:
         """Call *act*, which may block on the object store, in the thread that renews the lease."""
         return self._run(self._lease, act)
+
+    def plan(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act*, which may block on the object store, in the thread that makes floor plans.
+
+        It is a thread of its own, because a publication keeps that of `background` for seconds.
+        """
+        return self._run(self._plan, act)
 
     def background(self, act: Callable[[], _T]) -> Awaitable[_T]:
         """Call *act*, which may block, in the low-priority thread for snapshots, versions and deletions.

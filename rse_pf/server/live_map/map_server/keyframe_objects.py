@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rse_pf.errors import BadRequest, NotFound
-from rse_pf.geometry import Array, transform
+from rse_pf.geometry import Array, Camera, transform
 from rse_pf.live_map.versions import PointSource
 from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.keyframe_points import MAX_POINTS_BYTES, decode_points
@@ -66,7 +66,7 @@ class PointCloud:
 class KeyframeObjects:
     """The objects that belong to the keyframes of one live map.
 
-    All methods block on the object store, and are called by one thread at a time.
+    All methods block on the object store, and all but `read_points` are called by one thread at a time.
     """
 
     def __init__(self, store: ObjectStore, account: TenantAccount) -> None:
@@ -108,6 +108,19 @@ class KeyframeObjects:
             keyframes=len(clouds),
             missing=len(selected) - len(clouds),
         )
+
+    def read_points(self, source: PointSource) -> Array | None:
+        """Return the ``(n, 3)`` points (metres, camera frame) of one keyframe; any thread may call this.
+
+        Return None if the object is missing, has another size or digest than the keyframe says, or holds no
+        valid points.
+
+        Raises:
+            StoreError: The store fails.
+        """
+        data = self._read(source)
+        decoded = None if data is None else _decode_near(data, source.camera)
+        return None if decoded is None else decoded[0]
 
     def delete(self, objects: Iterable[tuple[str, str]]) -> None:
         """Delete objects, given as pairs of a robot's folder and a digest, and credit the tenant's account.
@@ -158,27 +171,37 @@ class KeyframeObjects:
         or digest than the keyframe says, or holds no valid points.  The encoded points are stored in the new
         cache up to `_MAX_CACHED_BYTES`; *old_cache*, by object name, has those of the last cloud.
         """
-        digest, size_bytes = source.reference.digest, source.reference.size
-        name = f"objects/{source.robot}/{digest}"
+        name = f"objects/{source.robot}/{source.reference.digest}"
         data = old_cache.get(name)
         if data is None:
-            try:
-                if not 0 < size_bytes <= MAX_POINTS_BYTES or self._store.head(name).size != size_bytes:
-                    return None
-                data = self._store.get(name)
-            except NotFound:
-                return None
-            if digest_of(data) != digest:
-                return None
+            data = self._read(source)
+        if data is None:
+            return None
         if self._cached_bytes + len(data) <= _MAX_CACHED_BYTES:
             self._cache[name] = data
             self._cached_bytes += len(data)
+        return _decode_near(data, source.camera)
+
+    def _read(self, source: PointSource) -> bytes | None:
+        digest, size_bytes = source.reference.digest, source.reference.size
+        name = f"objects/{source.robot}/{digest}"
         try:
-            points, colours = decode_points(data, source.camera)
-        except BadRequest:
+            if not 0 < size_bytes <= MAX_POINTS_BYTES or self._store.head(name).size != size_bytes:
+                return None
+            data = self._store.get(name)
+        except NotFound:
             return None
-        is_near = (np.abs(points) <= _MAX_DISTANCE_M).all(axis=1)
-        return points[is_near], colours[is_near]
+        return data if digest_of(data) == digest else None
+
+
+def _decode_near(data: bytes, camera: Camera) -> tuple[Array, Colours] | None:
+    """Return the points and colours of an object within `_MAX_DISTANCE_M`; None if it is not valid."""
+    try:
+        points, colours = decode_points(data, camera)
+    except BadRequest:
+        return None
+    is_near = (np.abs(points) <= _MAX_DISTANCE_M).all(axis=1)
+    return points[is_near], colours[is_near]
 
 
 def _select_evenly(sources: Sequence[PointSource]) -> list[PointSource]:

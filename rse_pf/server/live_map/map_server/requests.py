@@ -17,6 +17,7 @@ from rse_pf.identity import RobotId, folders_of, shown_name
 from rse_pf.live_map.events import KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
 from rse_pf.server.live_map.lease import MapLease
 from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
+from rse_pf.server.live_map.map_server.floor_plan import FloorPlanner
 from rse_pf.server.live_map.map_server.log import LogWriter
 from rse_pf.server.live_map.map_server.messages import (
     decode_request,
@@ -31,6 +32,7 @@ from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.wire.live_map import (
     PUBLISH,
     KeyframeRequest,
+    LiveFloorPlan,
     LiveForget,
     LiveMapRequest,
     LiveRelocalise,
@@ -79,6 +81,7 @@ class RequestHandler:
         self._charge = charge
         self._service_state = service_state
         self._start_task = start_task
+        self._floor_planner = FloorPlanner(environment, state)
         self._robot_names: dict[str, str] = {}  # displayed names, keyed by RobotId.folder
         # Keyframes that are being added, keyed by RobotId.folder and keyframe number.
         self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}
@@ -106,6 +109,8 @@ class RequestHandler:
                 return await self._take_keyframe(robot, request)
             case LiveRelocalise() as request:
                 return await self._relocalise(request)
+            case LiveFloorPlan() as request:
+                return await self._floor_planner.answer(request)
             case LiveForget() as request:
                 return await self._forget_robot(request)
             case LiveStart() as request:
