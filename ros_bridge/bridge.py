@@ -36,7 +36,7 @@ from ros_bridge.outgoing import Message, OutgoingMessages
 from ros_bridge.robot_frames import RobotFrames
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Camera, inverse
-from rse_pf.slam.occupancy import GridOptions
+from rse_pf.slam.occupancy import GridOptions, OccupancyGrid
 from rse_pf.terminal import show
 
 __all__ = ["Bridge", "CallReply", "OpenMapper", "Publish", "connected_bridge"]
@@ -51,6 +51,8 @@ PoseStatus = Literal["visual", "odometry", "lost"]
 _DIAGNOSTICS_EVERY_S = 1.0
 # Time between two messages with the path, in seconds.
 _PATH_EVERY_S = 0.5
+# Time between two requests for the floor plan of a live map, in seconds: its corrections arrive within 1 s.
+_LIVE_PLAN_EVERY_S = 0.25
 # Smallest number of measurements of a point that is published in the cloud of a robot's own map.
 _LEAST_READINGS = 2
 # Deadline of a call of the platform through the ROS service ``call``, in seconds.
@@ -138,6 +140,7 @@ class Bridge:
         self._reason = ""
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._plan_trouble = ""
+        self._plan: OccupancyGrid | None = None
         self._maps: MapServices | None = None
         self._seen: Camera | None = None
         self._statics: list[Transform] = []
@@ -362,7 +365,9 @@ class Bridge:
         if self._is_due("cloud", options.cloud_every_s):
             self._start("cloud", self._publish_cloud(mapper, stamp_ns, T_map_world))
         every_s = options.floor_plan_every_s
-        if every_s > 0 and not isinstance(mapper, LiveMapper) and self._is_due("floor plan", every_s):
+        if isinstance(mapper, LiveMapper):
+            every_s = min(every_s, _LIVE_PLAN_EVERY_S)
+        if every_s > 0 and self._is_due("floor plan", every_s):
             self._start("floor plan", self._publish_floor_plan(mapper, stamp_ns))
 
     def _is_due(self, name: str, every_s: float) -> bool:
@@ -462,19 +467,26 @@ class Bridge:
         for message in await asyncio.to_thread(made):
             self._publish(message)
 
-    async def _publish_floor_plan(self, mapper: Mapper, stamp_ns: int) -> None:
-        """Publish the floor plan, if the map is level; otherwise the status message says why not."""
-        if self._frames.T_base_camera is None:
-            self._plan_trouble = f"no floor plan: {self._frames.missing_mount or 'there is no base_frame'}"
-            return
+    async def _publish_floor_plan(self, mapper: Mapper | LiveMapper, stamp_ns: int) -> None:
+        """Publish the floor plan if it has changed and the map is level.
+
+        Otherwise the status message says why there is none.
+        """
         try:
-            plan = await asyncio.to_thread(mapper.floor_plan, GridOptions(up=(0.0, 0.0, 1.0)))
-        except UsageError as error:
+            if isinstance(mapper, LiveMapper):
+                plan = await mapper.floor_plan(max_age_s=self._options.floor_plan_every_s)
+            elif self._frames.T_base_camera is None:
+                raise UsageError(self._frames.missing_mount or "there is no base_frame")
+            else:
+                plan = await asyncio.to_thread(mapper.floor_plan, GridOptions(up=(0.0, 0.0, 1.0)))
+        except RsePfError as error:
             self._plan_trouble = f"no floor plan: {error.message}"
             return
         self._plan_trouble = ""
-        for message in self._outgoing.floor_plan(stamp_ns, plan):
-            self._publish(message)
+        if plan is not self._plan:
+            self._plan = plan
+            for message in self._outgoing.floor_plan(stamp_ns, plan):
+                self._publish(message)
 
     async def _report(self) -> None:
         """Publish the status of the bridge each second, also if no frames arrive, until cancelled."""

@@ -91,7 +91,8 @@ class BridgeOptions:
             future.
         max_correction_m_s: Largest speed (m/s) at which a correction moves the robot in the tree of frames; a
             rotation by 1 rad counts as 1 m.  0: corrections are applied at once.
-        floor_plan_every_s: Time between two floor plans of the robot's own map, in seconds; 0: none.
+        floor_plan_every_s: Time between two floor plans, in seconds; 0: none.  That of a live map is also
+            published at once after a correction.
         cloud_every_s: Time between two clouds, in seconds.
         path_poses: Largest number of poses of a path; above it, every second pose is left out.
         out: Folder that the service ``save`` writes to; empty: the service fails.
@@ -160,11 +161,6 @@ class BridgeOptions:
             )
         if not self.colour or not self.info:
             raise UsageError("a topic of colours and its camera_info are needed", hint="colour, info")
-        if self.map and self.floor_plan_every_s:
-            raise UsageError(
-                "a robot in a live map publishes no floor plan: the map of all robots has one",
-                hint="leave floor_plan_every_s out; rse-pf map export --format occupancy exports the plan",
-            )
         if self.map and not self.partner:
             raise UsageError(
                 "a live map needs a topic of depth, or of right images",

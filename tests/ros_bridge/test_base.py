@@ -19,9 +19,11 @@ from client_sdk.bags.message_types import (
     TF,
 )
 from client_sdk.frontend import Frame, TrackedFrame
+from client_sdk.live import LiveMapper
 from ros_bridge import Bridge
 from ros_bridge.base_poses import project_to_plane
 from ros_bridge.outgoing import Message
+from rse_pf.errors import NotFound
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.slam.occupancy import FREE, OCCUPIED, UNKNOWN, GridOptions, OccupancyGrid
 from tests.kit.bridge_runs import (
@@ -39,6 +41,7 @@ from tests.kit.bridge_runs import (
 from tests.kit.flat_world import STEP_M, covered, frame_at
 
 ROWS = 6
+LEVEL = GridOptions(up=(0.0, 0.0, 1.0))
 CAMERA_AXES = np.eye(4)  # pose of an optical frame (z ahead, y down) in a frame with x ahead and z up
 CAMERA_AXES[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
 TILTED = exp_se3(np.array([0.25, 0.05, 0.6, 0.0, math.radians(30), 0.0]))
@@ -83,7 +86,7 @@ class ExactMapper:
         )  # fmt: skip
 
     def floor_plan(self, options: GridOptions) -> OccupancyGrid:
-        assert options.up == (0.0, 0.0, 1.0)
+        assert options == LEVEL
         return OccupancyGrid(
             cells=np.array([[OCCUPIED, UNKNOWN, FREE], [FREE, FREE, FREE]], np.uint8), origin_m=(-1.0, 2.0),
             resolution_m=0.25, floor_m=-0.1, T_grid_world=np.eye(4), up_source="--up",
@@ -413,6 +416,33 @@ async def test_a_floor_plan_is_in_the_map_with_percents_of_occupancy() -> None:
     assert plan.data.tolist() == [100, -1, 0, 0, 0, 0]
     corner = plan.info.origin.position
     assert (corner.x, corner.y, plan.info.resolution) == (-1.0, 2.0, 0.25)
+
+
+async def test_the_floor_plan_of_a_live_map_is_published_when_it_has_changed() -> None:
+    heard, plans, asked = Heard(), [ExactMapper(None).floor_plan(LEVEL) for _ in range(2)], []
+
+    class Live(ExactMapper, LiveMapper):
+        """A live map whose plan changes with the fourth request."""
+
+        T_map_odom, covariance, name, state = np.eye(4), None, "hall", "live"  # type: ignore[assignment]
+        aligned, trouble, reason, map = True, "", "", None  # type: ignore[assignment]
+
+        async def floor_plan(self, options: Any = None, *, max_age_s: float = 0.0) -> OccupancyGrid:
+            asked.append(max_age_s)
+            if len(asked) == 2:
+                raise NotFound("the map shows no floor")
+            return plans[len(asked) >= 4]
+
+    options = {"base_frame": "base_link", "map": "hall", "floor_plan_every_s": 0.01}
+    async with running(heard, make_mapper=Live, before=send_urdf, **options) as bridge:
+        for row in range(100):
+            send(bridge, frame_at(row, depth=True), row)
+            await heard.until(count_of(POSE_WITH_COVARIANCE, row + 1))
+            if len(asked) > 5:
+                break
+
+    assert set(asked) == {0.01}
+    assert len(heard.of(OCCUPANCY_GRID, topic="/rse_pf/floor_plan")) == 2
 
 
 async def test_wheels_that_start_late_replace_the_odometry_by_the_camera() -> None:

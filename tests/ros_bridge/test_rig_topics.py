@@ -167,7 +167,6 @@ def test_a_frame_waits_for_the_sample_after_it_but_not_for_a_silent_imu(tmp_path
         ({"right": "/right"}, "camera_info of its right images"),
         ({"imu": "/imu"}, "where the IMU sits"),
         ({"map": "hall", "depth": ""}, "depth, or of right images"),
-        ({"map": "hall", "floor_plan_every_s": "5"}, "in a live map publishes no floor plan"),
         ({"transform_tolerance_s": "-1"}, "is not a finite number of 0 or above"),
         ({"transform_tolerance_s": "inf"}, "is not a finite number of 0 or above"),
     ],
