@@ -306,17 +306,19 @@ def _lines_of_sight(
     the length of a cell before the feature, because the cell of the feature itself is not free.  Lines of
     which nothing is left are dropped, so that *n* may be 0.
     """
-    starts, ends = [np.empty((0, 3))], [np.empty((0, 3))]
     max_per_keyframe = max(1, max_lines // len(T_grid_camera))
     # 1. Take the lines from each keyframe to those of its features that lie in front of the camera, not
     # farther than `_MAX_RAY_M` along any axis; thin them evenly to the share of a keyframe.
-    for seen, T in zip(sights_camera, T_grid_camera, strict=True):
-        points = seen.astype(np.float64)
-        points = points[(np.abs(points) <= _MAX_RAY_M).all(axis=1) & (points[:, 2] > 0.0)]
-        points = points[:: max(1, math.ceil(len(points) / max_per_keyframe))]
-        ends.append(transform(T, points))
-        starts.append(np.broadcast_to(T[:3, 3], points.shape))
-    start, end = np.concatenate(starts), np.concatenate(ends)
+    points = np.concatenate(sights_camera).astype(np.float64)
+    keyframe = np.repeat(np.arange(len(sights_camera)), [len(seen) for seen in sights_camera])
+    is_usable = (np.abs(points) <= _MAX_RAY_M).all(axis=1) & (points[:, 2] > 0.0)
+    points, keyframe = points[is_usable], keyframe[is_usable]
+    count = np.bincount(keyframe, minlength=len(sights_camera))
+    place = np.arange(len(points)) - (np.cumsum(count) - count)[keyframe]
+    is_chosen = place % np.maximum(1, -(-count // max_per_keyframe))[keyframe] == 0
+    T = T_grid_camera[keyframe[is_chosen]]
+    start = T[:, :3, 3]
+    end = np.einsum("nij,nj->ni", T[:, :3, :3], points[is_chosen]) + start
     direction = end - start
     length_m = np.maximum(np.linalg.norm(direction, axis=1), 1e-9)
     # 2. Find where each line crosses the lowest and the highest permitted height, as shares of its length: 0

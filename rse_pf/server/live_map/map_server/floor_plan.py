@@ -35,7 +35,7 @@ _POINTS = 300  # points of a keyframe in a plan; keyframes are 0.1 m apart, so t
 _SIGHTS = (
     50  # points of a keyframe to which lines of sight are drawn, half of them features, which are farther
 )
-_MAX_LINES = 20_000  # lines of sight of a plan: as many as half of the CPU time of a plan draws
+_MAX_LINES = 10_000  # lines of sight of a plan, which take a third of its CPU time
 _MAX_POINTS = 1_500_000  # points of a plan, which bounds its CPU time; of more, an even selection is used
 _READING_S = 0.2  # longest time for which a plan waits for stored points; the next plan reads on
 _FIRST_WAIT_S = 1.0  # time after which a missing object is looked for again; it doubles each time
