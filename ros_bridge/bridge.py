@@ -28,7 +28,7 @@ from client_sdk.robot import Robot
 from client_sdk.wheel_odometry import OdometryReading
 from ros_bridge.access import connect_robot
 from ros_bridge.base_poses import BasePoses
-from ros_bridge.frame_tree import Transform
+from ros_bridge.frame_tree import Transform, pose_of
 from ros_bridge.incoming import TOO_FAST, IncomingFrames, PairedImages, Role, kind_of
 from ros_bridge.map_services import MapServices, as_json
 from ros_bridge.options import BridgeOptions
@@ -36,6 +36,7 @@ from ros_bridge.outgoing import Message, OutgoingMessages
 from ros_bridge.robot_frames import RobotFrames
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.slam.localise import PosePrior
 from rse_pf.slam.occupancy import GridOptions, OccupancyGrid
 from rse_pf.terminal import show
 
@@ -171,7 +172,7 @@ class Bridge:
 
     def receive(self, role: Role, data: bytes | memoryview) -> None:
         """Store the bytes of a message of the topic *role*; never waits and raises no error."""
-        if role in ("odometry", "tf", "tf_static"):
+        if role in ("odometry", "tf", "tf_static", "initialpose"):
             self._receive_frames(role, data)
         elif self._incoming.add(role, data):
             self._set(self._has_frame)
@@ -181,7 +182,9 @@ class Bridge:
             return
         try:
             message = self._maker.decode(kind_of(role, ""), data)
-            if role == "odometry":
+            if role == "initialpose":
+                self._receive_initial_pose(message)
+            elif role == "odometry":
                 self._frames.add_odometry(message)
             else:
                 self._frames.add_transforms(message, is_static=role == "tf_static")
@@ -189,6 +192,29 @@ class Bridge:
             self._incoming.check.refuse("broken", f"a message of {role} cannot be used: {error}")
         if role == "tf_static":
             self._set(self._has_static)
+
+    def _receive_initial_pose(self, message: Any) -> None:
+        """Let the mapper expect the robot at a pose in the map; raises BrokenMessage for one that is none."""
+        frame, pose = message.header.frame_id.strip("/"), message.pose.pose
+        T_map_base = pose_of(pose.position, pose.orientation)
+        if T_map_base is None or frame != self._frames.map:
+            raise BrokenMessage(f"it is no pose in {self._frames.map}, but in {frame}")
+        T_base_camera = _IDENTITY if self._frames.T_base_camera is None else self._frames.T_base_camera
+        try:
+            prior = PosePrior(
+                T_map_camera=T_map_base @ T_base_camera,
+                covariance=np.array(message.pose.covariance, np.float64).reshape(6, 6),
+            )
+        except RsePfError as error:
+            raise BrokenMessage(error.message) from error
+        with contextlib.suppress(RuntimeError):  # the event loop is closed: the bridge has stopped
+            self._loop.call_soon_threadsafe(self._expect, prior)
+
+    def _expect(self, prior: PosePrior) -> None:
+        if isinstance(self._mapper, LiveMapper):
+            self._mapper.relocalise(prior)
+        else:
+            self._print_once("an initial pose came before the first image, and is not used: give it again")
 
     def _set(self, event: asyncio.Event) -> None:
         with contextlib.suppress(RuntimeError):  # the event loop is closed: the bridge has stopped

@@ -20,7 +20,15 @@ from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth, format_of
 from client_sdk.bags.lens import lens_of
 from client_sdk.bags.message_maker import MessageMaker
-from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU, ODOMETRY, TF
+from client_sdk.bags.message_types import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    ODOMETRY,
+    POSE_WITH_COVARIANCE,
+    TF,
+)
 from client_sdk.cameras.source import make_empty_depth
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import ImageMap, map_to_pinhole
@@ -33,8 +41,10 @@ from rse_pf.geometry import Camera, Lens
 
 __all__ = ["TOO_FAST", "IncomingFrames", "PairedImages", "Role", "kind_of"]
 
-Role = Literal["colour", "depth", "right", "info", "right_info", "imu", "odometry", "tf", "tf_static"]
-_FRAME_KINDS = {"odometry": ODOMETRY, "tf": TF, "tf_static": TF}
+Role = Literal[
+    "colour", "depth", "right", "info", "right_info", "imu", "odometry", "tf", "tf_static", "initialpose"
+]
+_FRAME_KINDS = {"odometry": ODOMETRY, "tf": TF, "tf_static": TF, "initialpose": POSE_WITH_COVARIANCE}
 # Exceptions that decoding of a malformed message may raise.
 _FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 # A time stamp this far before the last frame, in ns, means that the clock was set back or a bag plays again.

@@ -13,6 +13,8 @@ from rse_pf.terminal import show
 
 __all__ = ["end_by_signal", "queue_of", "run_until", "taken"]
 
+# Topic on which RViz publishes the pose that an operator gives, as AMCL takes it.
+_INITIAL_POSE: Role = "initialpose"
 _ROLES: tuple[Role, ...] = ("info", "right_info", "imu", "odometry", "right", "depth", "colour")
 _TF_ROLES: tuple[Role, ...] = ("tf_static", "tf")
 # Length of the subscriber's queue of an IMU: half a second at 2 kHz.
@@ -26,12 +28,14 @@ def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
     frames = [(role, f"/{role}", kind_of(role, "")) for role in _TF_ROLES]
     left_out = {"depth", "right"} - {options.partner}
     topics = ((role, str(getattr(options, role))) for role in _ROLES if role not in left_out)
+    if options.map:
+        frames.append((_INITIAL_POSE, options.named(_INITIAL_POSE), kind_of(_INITIAL_POSE, "")))
     return frames + [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
 
 
 def queue_of(role: Role, options: BridgeOptions) -> int:
     """Return the length of the subscriber's queue for the topic *role*."""
-    if role in ("odometry", *_TF_ROLES):
+    if role in ("odometry", _INITIAL_POSE, *_TF_ROLES):
         return _TRANSFORMS
     return _IMU_SAMPLES if role == "imu" else options.queue_frames
 

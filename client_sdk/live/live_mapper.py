@@ -56,6 +56,7 @@ from client_sdk.trajectory import Trajectory
 from client_sdk.wheel_odometry import OdometryReading
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
+from rse_pf.slam.localise import PosePrior
 from rse_pf.slam.occupancy import GridOptions, OccupancyGrid
 from rse_pf.wire.live_map import live_topic
 
@@ -429,13 +430,22 @@ class LiveMapper:
         """Features of the last frame, if it has a pose and depth; see `Mapper.features`."""
         return self._mapper.features
 
-    def relocalise(self) -> None:
+    def relocalise(self, prior: PosePrior | None = None) -> None:
         """Relocalise with the next keyframe of an unaligned segment, without the usual pause; return at once.
 
         Nothing is asked without a connection, and while the map has no other keyframes than those that this
         robot has sent in this run.
+
+        Args:
+            prior: Where the camera is now in the map.  The robot sends it, moved with its odometry, until it
+                is localised; a segment that was aligned by a relocalisation is relocalised once more.  A
+                place within 3 standard deviations then needs less evidence, and is preferred to others that
+                look alike; a place elsewhere is accepted as without a prior.
         """
         self._relocaliser.skip_pause()
+        if prior is not None:
+            has_metres = self._poses and self._mapper.monocular_tracker is None
+            self._relocaliser.expect(prior, self._poses[-1][2] if has_metres else None)
 
     async def floor_plan(
         self, options: GridOptions | None = None, *, max_age_s: float = 0.0
@@ -660,7 +670,8 @@ class LiveMapper:
         self._made_keyframes += 1
         self._sender.notify_added()
         has_foreign_keyframes = self._alignments.map_keyframes > len(self.sent_keyframes)
-        if not self.aligned and self._robot.connected and has_foreign_keyframes:
+        is_sure = self.aligned and not (self._relocaliser.has_prior and self.aligned_by == "relocalisation")
+        if not is_sure and self._robot.connected and has_foreign_keyframes:
             self._relocaliser.start_if_due(keyframe, T_odom_camera)
         return True
 

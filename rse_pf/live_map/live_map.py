@@ -80,7 +80,7 @@ from rse_pf.live_map.versions import (
 from rse_pf.maps.descriptors import DescriptorKind, check_same_kind
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.keyframe import SentKeyframe, check_odometry_range, decode_keyframe
-from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
+from rse_pf.slam.localise import LocalisationOptions, Localised, PosePrior, localise, spread_candidates
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.place_recognition import PlaceIndex, place_vector
 from rse_pf.slam.pose_graph import PoseGraph
@@ -387,8 +387,12 @@ class LiveMap:
         """
         return self.prepare_relocalisation(view)()
 
-    def prepare_relocalisation(self, view: SentKeyframe) -> Callable[[], Localised]:
+    def prepare_relocalisation(
+        self, view: SentKeyframe, prior: PosePrior | None = None
+    ) -> Callable[[], Localised]:
         """Return a function that does the work of `relocalise`, in any thread while the map changes.
+
+        With a *prior*, half of the keyframes that are compared are those near it, if there are so many.
 
         Raises:
             BadRequest: The descriptors of *view* are of another kind than those of the map.
@@ -401,19 +405,23 @@ class LiveMap:
         limit = self.options.candidates
         vector = place_vector(view.features.descriptors)
         nearest = self._places.nearest(vector, RELOCALISATION_POOL * limit, allowed)
+        T, options = graph.T_component_camera, LocalisationOptions()
+        if prior is not None and len(allowed):
+            is_near = prior.contains(T[allowed], options.region_m, options.region_deg)
+            expected = self._places.nearest(vector, limit // 2, allowed[is_near])
+            nearest = list(dict([*expected, *nearest]).items())  # each keyframe once, the expected ones first
         # 2. Copy the poses of these keyframes, since the map may change before the returned function runs.
-        T = graph.T_component_camera
         chosen = [
             (self._stored(i), T[i].copy(), graph.segment_of(i).scale)
             for i in spread_candidates(nearest, T, limit)
         ]
         candidates = [(stored, pose, scale) for stored, pose, scale in chosen if stored is not None]
-        options = LocalisationOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
+        options = replace(options, has_equal_rooms=graph.equal_rooms_m > 0.0)
         image, scale_of_view = view_of_features(view.features, view.camera), assumed_scale(view.features)
 
         def run() -> Localised:
             placed = [placed_keyframe(stored, pose, scale) for stored, pose, scale in candidates]
-            found = localise(placed, image, options)
+            found = localise(placed, image, options, prior=prior)
             return found if found.scale is None else replace(found, scale=found.scale * scale_of_view)
 
         return run

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import PnpError
-from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, transform
+from rse_pf.errors import BadRequest, PnpError
+from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, rigid, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.slam.camera_fit import CameraFit, fit_camera
 from rse_pf.slam.guided_search import MapLandmarks, search_around
@@ -35,6 +35,7 @@ __all__ = [
     "LocalisationCandidate",
     "LocalisationOptions",
     "Localised",
+    "PosePrior",
     "is_in_region",
     "localise",
     "spread_candidates",
@@ -65,6 +66,17 @@ common; its square is added to the variance of a guided search."""
 _GUIDED_FLOOR_DEG = 0.3
 """Standard deviation about each axis, in degrees, of the error that all landmarks around a pose have in
 common; its square is added to the variance of a guided search."""
+_MAX_PRIOR_SIGMAS = 3.0
+"""Largest distance of an expected pose from its prior, in standard deviations."""
+_PRIOR_FLOOR_M = 0.2
+"""Standard deviation along each axis, in metres, that is added to a prior: a planar one states none of the
+height."""
+_PRIOR_FLOOR_DEG = 5.0  # standard deviation about each axis, in degrees, that is added to a prior
+_MAX_PRIOR_VARIANCE = 1e12  # largest element of the covariance of a prior, m^2: larger than any map
+_MAX_PRIOR_ROUNDING = 1e-6  # largest negative eigenvalue of a covariance that counts as rounding
+_MIN_EXPECTED_SHARE = 0.5
+"""An estimate near the prior is preferred if it has at least this share of the inliers of the best one: equal
+places give nearly equal numbers, a wrong prior a small one."""
 _FEW_MATCHES = ("few-inliers", "low-inlier-ratio", "one-keyframe")
 """Reasons that concern the matches of single keyframes; they do not hold for the pose of a guided search that
 is sure."""
@@ -107,6 +119,48 @@ class LocalisationOptions:
     max_per_region: int = 4
     has_equal_rooms: bool = False
     fits_camera: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosePrior:
+    """Where a camera is expected to be, such as an operator says.
+
+    Attributes:
+        T_map_camera: ``(4, 4)``, metres.
+        covariance: ``(6, 6)`` of position (metres) and rotation (radians) about the axes of the map.
+
+    Raises:
+        BadRequest: The pose is no rigid motion, or the covariance is not positive semidefinite.
+    """
+
+    T_map_camera: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        T, covariance = rigid(self.T_map_camera), self.covariance
+        is_bounded = bool((np.abs(covariance) <= _MAX_PRIOR_VARIANCE).all())
+        if T is None or not is_bounded or np.linalg.eigvalsh(covariance)[0] < -_MAX_PRIOR_ROUNDING:
+            raise BadRequest(
+                "the prior is no rigid motion with a positive semidefinite covariance",
+                hint="send a pose in the map, and the covariance of its position and rotation",
+            )
+        object.__setattr__(self, "T_map_camera", T)  # a frozen dataclass allows no other way
+
+    def contains(
+        self, T_map_cameras: Array, reach_m: float = 0.0, reach_deg: float = 0.0
+    ) -> npt.NDArray[np.bool_]:
+        """Return ``(n,)``, whether each pose ``(n, 4, 4)`` is within 3 standard deviations of this one.
+
+        The reaches enlarge these distances, in quadrature: a camera there may see what is expected here.
+        """
+        turns = log_se3(T_map_cameras @ inverse(self.T_map_camera))[:, 3:]
+        apart = np.hstack((T_map_cameras[:, :3, 3] - self.T_map_camera[:3, 3], turns))
+        length_m = _PRIOR_FLOOR_M**2 + (reach_m / _MAX_PRIOR_SIGMAS) ** 2
+        angle_deg2 = _PRIOR_FLOOR_DEG**2 + (reach_deg / _MAX_PRIOR_SIGMAS) ** 2
+        covariance = self.covariance + np.diag([length_m] * 3 + [math.radians(1.0) ** 2 * angle_deg2] * 3)
+        sigmas2 = np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart.T).T)
+        is_within: npt.NDArray[np.bool_] = sigmas2 <= _MAX_PRIOR_SIGMAS**2
+        return is_within
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,6 +233,7 @@ def localise(
     options: LocalisationOptions = _DEFAULT,
     *,
     landmarks_around: Callable[[Array, Sequence[int]], MapLandmarks] | None = None,
+    prior: PosePrior | None = None,
 ) -> Localised:
     """Return the pose of *view* in the map of *candidates*; deterministic.
 
@@ -191,6 +246,9 @@ def localise(
         landmarks_around: Returns the landmarks of the map around a pose ``(4, 4)``, also those of the given
             ids of candidates.  With it, the pose of a view without depths is that of a guided search if this
             finds one, see `search_around`; None for no such search.
+        prior: Where the camera is expected.  A pose there needs half of the inliers, or agreeing keyframes or
+            30 of them, and other places that look alike do not make it ambiguous unless they have twice as
+            many.  A pose elsewhere is accepted as without a prior.
 
     Raises:
         BadRequest: The descriptors of a candidate and of the view are of different kinds.
@@ -202,6 +260,8 @@ def localise(
     estimates = _estimate_poses(candidates, view, options)
     if not estimates:
         return Localised(verdict="none", reason="no-pose")
+    if prior is not None:
+        estimates, options = _prefer_expected(estimates, prior, options)
     # 2. Divide the estimates into those that agree with the best one, which has most inliers, and the others.
     best = estimates[0]
     agreeing = [estimate for estimate in estimates if _do_agree(estimate, best, options)]
@@ -315,6 +375,25 @@ def _estimate_poses(
             )
         )
     return sorted(estimates, key=lambda estimate: (-estimate.measured.inliers, estimate.keyframe))
+
+
+def _prefer_expected(
+    estimates: list[_Estimate], prior: PosePrior, options: LocalisationOptions
+) -> tuple[list[_Estimate], LocalisationOptions]:
+    """Return the estimates near the prior, and options that ask for less evidence.
+
+    Return the arguments if no estimate is near the prior, or if it has too few inliers beside the best one.
+    """
+    is_expected = prior.contains(np.array([estimate.T_map_camera for estimate in estimates]))
+    expected = [estimate for estimate, is_near in zip(estimates, is_expected, strict=True) if is_near]
+    if not expected or (expected[0].measured.inliers < _MIN_EXPECTED_SHARE * estimates[0].measured.inliers):
+        return estimates, options
+    min_inliers = options.relative_pose.min_inliers
+    return expected, replace(
+        options,
+        relative_pose=replace(options.relative_pose, min_inliers=min_inliers // 2),
+        min_single_inliers=min_inliers,
+    )
 
 
 def _estimate_scale(estimates: Sequence[_Estimate], options: LocalisationOptions) -> float | None:

@@ -41,6 +41,7 @@ __all__ = [
     "MapCause",
     "MapUpdate",
     "PoseUpdate",
+    "PriorPose",
     "RelocaliseReply",
     "live_topic",
     "map_of_topic",
@@ -102,14 +103,27 @@ class KeyframeKept(_Value, frozen=True, kw_only=True):
     version: int
 
 
-class LiveRelocalise(_Value, frozen=True, kw_only=True):
-    """Request of ``live-relocalise``: find the pose of ``keyframe`` in the map, by its image features alone.
+class PriorPose(_Value, frozen=True, kw_only=True):
+    """Where a camera is expected: its pose in the map, and how well it is known.
 
-    The pose that the keyframe states does not count, and the keyframe is not added to the map.
+    ``covariance`` is the upper triangle of the covariance of position (metres) and rotation (radians) about
+    the axes of the map.
+    """
+
+    T_map_camera: Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)]
+    covariance: Annotated[list[float], msgspec.Meta(min_length=21, max_length=21)]
+
+
+class LiveRelocalise(_Value, frozen=True, kw_only=True, omit_defaults=True):
+    """Request of ``live-relocalise``: find the pose of ``keyframe`` in the map, by its image features.
+
+    The pose that the keyframe states does not count, and the keyframe is not added to the map.  ``prior``
+    says where the camera is expected.
     """
 
     map: _MapName
     keyframe: bytes
+    prior: PriorPose | None = None
 
 
 class RelocaliseReply(_Value, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from rse_pf.errors import Conflict, Expired, NotFound, RsePfError
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.wire import as_type
-from rse_pf.wire.live_map import KeyframeRequest, LiveFloorPlan, LiveRelocalise
+from rse_pf.wire.live_map import KeyframeRequest, LiveFloorPlan, LiveRelocalise, PriorPose
 
 __all__ = ["FakeLiveRobot", "alignment", "solve", "solved"]
 
@@ -66,6 +66,8 @@ class FakeLiveRobot:
         """Called with the name of a service before the service answers; may raise the error of the call."""
         self.lose_answer = False
         self.asked: list[str] = []
+        self.priors: list[PriorPose | None] = []
+        """The prior of each request to relocalise."""
         self.relocalised: dict[str, Any] = {"verdict": "none", "reason": "nothing alike"}
         self.plans: list[dict[str, Any]] = []
         """The replies to requests for the floor plan, in their order; the last one is repeated."""
@@ -147,7 +149,8 @@ class FakeLiveRobot:
         return {"number": len(self.kept), "version": len(self.kept)}
 
     def _relocalise(self, request: Any) -> Any:
-        as_type(msgspec.to_builtins(request, builtin_types=(bytes,)), LiveRelocalise)
+        asked = as_type(msgspec.to_builtins(request, builtin_types=(bytes,)), LiveRelocalise)
+        self.priors.append(asked.prior)
         return self.relocalised
 
     def _floor_plan(self, request: LiveFloorPlan) -> Any:

@@ -101,7 +101,7 @@ class FakeMap:
     def prepare_optimisation(self, solve: GraphOptimiser | None = None) -> Callable[[], Optimised]:
         return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
 
-    def prepare_relocalisation(self, view: SentKeyframe) -> Callable[[], Any]:
+    def prepare_relocalisation(self, view: SentKeyframe, prior: Any = None) -> Callable[[], Any]:
         raise BadRequest("the fake map cannot relocalise")
 
     def alignments(self) -> list[Alignment]:

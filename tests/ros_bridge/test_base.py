@@ -25,8 +25,10 @@ from ros_bridge.base_poses import project_to_plane
 from ros_bridge.outgoing import Message
 from rse_pf.errors import NotFound
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
+from rse_pf.slam.localise import PosePrior
 from rse_pf.slam.occupancy import FREE, OCCUPIED, UNKNOWN, GridOptions, OccupancyGrid
 from tests.kit.bridge_runs import (
+    MAKER,
     START_NS,
     STEP_NS,
     Heard,
@@ -418,30 +420,61 @@ async def test_a_floor_plan_is_in_the_map_with_percents_of_occupancy() -> None:
     assert (corner.x, corner.y, plan.info.resolution) == (-1.0, 2.0, 0.25)
 
 
+class LiveExactMapper(ExactMapper, LiveMapper):
+    """An exact mapper in a live map, whose plan changes with the fourth request."""
+
+    T_map_odom, covariance, name, state = np.eye(4), None, "hall", "live"  # type: ignore[assignment]
+    aligned, trouble, reason, map = True, "", "", None  # type: ignore[assignment]
+
+    def __init__(self, T_base_camera: Array | None) -> None:
+        super().__init__(T_base_camera)
+        self.asked: list[float] = []
+        self.priors: list[PosePrior | None] = []
+        self.plans = [ExactMapper(None).floor_plan(LEVEL) for _ in range(2)]
+
+    async def floor_plan(self, options: Any = None, *, max_age_s: float = 0.0) -> OccupancyGrid:
+        self.asked.append(max_age_s)
+        if len(self.asked) == 2:
+            raise NotFound("the map shows no floor")
+        return self.plans[len(self.asked) >= 4]
+
+    def relocalise(self, prior: PosePrior | None = None) -> None:
+        self.priors.append(prior)
+
+
+async def test_an_initial_pose_is_the_prior_of_the_camera_in_the_live_map() -> None:
+    heard, mapper = Heard(), LiveExactMapper(MOUNT)
+    covariance = np.diag([0.25, 0.25, 0.0, 0.0, 0.0, 0.068])
+
+    def initial_pose(frame: str, T: Array) -> bytes:
+        message = MAKER.pose_with_covariance(START_NS, frame, T, covariance)
+        return MAKER.encode(POSE_WITH_COVARIANCE, message)
+
+    options = {"base_frame": "base_link", "map": "hall"}
+    async with running(heard, make_mapper=lambda _: mapper, before=send_urdf, **options) as bridge:
+        send(bridge, frame_at(0, depth=True), 0)
+        await heard.until(count_of(POSE_WITH_COVARIANCE, 1))
+        for frame, T in (("odom", MAP_START), ("map", MAP_START + math.nan), ("map", MAP_START)):
+            bridge.receive("initialpose", initial_pose(frame, T))
+        await heard.until(lambda _: bool(mapper.priors))
+
+    (prior,) = mapper.priors
+    assert prior is not None
+    np.testing.assert_allclose(prior.T_map_camera, MAP_START @ MOUNT, atol=1e-9)
+    np.testing.assert_array_equal(prior.covariance, covariance)
+
+
 async def test_the_floor_plan_of_a_live_map_is_published_when_it_has_changed() -> None:
-    heard, plans, asked = Heard(), [ExactMapper(None).floor_plan(LEVEL) for _ in range(2)], []
-
-    class Live(ExactMapper, LiveMapper):
-        """A live map whose plan changes with the fourth request."""
-
-        T_map_odom, covariance, name, state = np.eye(4), None, "hall", "live"  # type: ignore[assignment]
-        aligned, trouble, reason, map = True, "", "", None  # type: ignore[assignment]
-
-        async def floor_plan(self, options: Any = None, *, max_age_s: float = 0.0) -> OccupancyGrid:
-            asked.append(max_age_s)
-            if len(asked) == 2:
-                raise NotFound("the map shows no floor")
-            return plans[len(asked) >= 4]
-
+    heard, mapper = Heard(), LiveExactMapper(MOUNT)
     options = {"base_frame": "base_link", "map": "hall", "floor_plan_every_s": 0.01}
-    async with running(heard, make_mapper=Live, before=send_urdf, **options) as bridge:
+    async with running(heard, make_mapper=lambda _: mapper, before=send_urdf, **options) as bridge:
         for row in range(100):
             send(bridge, frame_at(row, depth=True), row)
             await heard.until(count_of(POSE_WITH_COVARIANCE, row + 1))
-            if len(asked) > 5:
+            if len(mapper.asked) > 5:
                 break
 
-    assert set(asked) == {0.01}
+    assert set(mapper.asked) == {0.01}
     assert len(heard.of(OCCUPANCY_GRID, topic="/rse_pf/floor_plan")) == 2
 
 

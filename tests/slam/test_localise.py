@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rse_pf.errors import BadRequest
 from rse_pf.geometry import exp_se3, inverse, pose_difference
 from rse_pf.live_map.measure import landmarks_of_features, view_of_features
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features
@@ -14,6 +15,7 @@ from rse_pf.slam.localise import (
     LocalisationCandidate,
     LocalisationOptions,
     Localised,
+    PosePrior,
     localise,
     spread_candidates,
 )
@@ -43,13 +45,20 @@ TURNED = T_VIEW @ exp_se3([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]) @ inverse(T_VIEW)
 """A rotation of the map by 1 rad about the camera of `VIEW`."""
 
 
-def place_of(candidates, view: KeyframeFeatures, camera, *options: LocalisationOptions) -> Localised:
+def place_of(
+    candidates, view: KeyframeFeatures, camera, *options: LocalisationOptions, prior: PosePrior | None = None
+) -> Localised:
     """Localise *view* among candidates, given as id, features, camera and pose."""
     placed = [
         LocalisationCandidate(id=number, landmarks=landmarks_of_features(features, of), T_map_keyframe=T)
         for number, features, of, T in candidates
     ]
-    return localise(placed, view_of_features(view, camera), *options)
+    return localise(placed, view_of_features(view, camera), *options, prior=prior)
+
+
+def prior_at(T_map_camera) -> PosePrior:
+    """Return a prior of RViz: 0.5 m and 15 degrees in the plane, without a deviation of the height."""
+    return PosePrior(T_map_camera=T_map_camera, covariance=np.diag([0.25, 0.25, 0.0, 0.0, 0.0, 0.068]))
 
 
 def renumbered(candidates, first: int):
@@ -96,6 +105,55 @@ def test_two_places_that_look_alike_are_ambiguous(other):
 
     assert (found.verdict, found.reason) == ("weak", "ambiguous")
     assert found.T_map_camera is not None
+
+
+@pytest.mark.parametrize("other", [ELSEWHERE, TURNED], ids=["elsewhere", "turned"])
+@pytest.mark.parametrize("is_other", [False, True], ids=["here", "there"])
+def test_a_prior_decides_between_two_places_that_look_alike(other, is_other):
+    twice = MAP + renumbered([(n, f, c, other @ T) for n, f, c, T in MAP], 10)
+    true = other @ T_VIEW if is_other else T_VIEW
+
+    found = place_of(twice, VIEW, CAMERA, prior=prior_at(true @ exp_se3([0.4, 0.1, 0.3, 0.05, 0.1, 0.05])))
+
+    assert (found.verdict, found.reason) == ("ok", "")
+    metres, degrees = pose_difference(found.T_map_camera, true)
+    assert metres < 0.01
+    assert degrees < 0.2
+
+
+def test_a_place_outside_of_a_wrong_prior_needs_the_evidence_that_it_needs_without_one():
+    wrong = prior_at(exp_se3([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]) @ T_VIEW)
+
+    assert place_of(MAP, VIEW, CAMERA, prior=wrong).verdict == "ok"
+    alone = LocalisationOptions(min_single_inliers=1000)
+    assert place_of(MAP[1:2], VIEW, CAMERA, alone, prior=wrong).reason == "one-keyframe"
+
+
+@pytest.mark.parametrize("reason", ["one-keyframe", "few-inliers"])
+def test_a_place_within_the_prior_needs_less_evidence(reason):
+    inliers = place_of(MAP, VIEW, CAMERA).inliers
+    options = LocalisationOptions(min_single_inliers=1000)
+    if reason == "few-inliers":
+        strict = replace(options.relative_pose, min_inliers=int(1.5 * inliers))
+        options = replace(options, relative_pose=strict)
+    used = MAP[1:2] if reason == "one-keyframe" else MAP
+
+    assert place_of(used, VIEW, CAMERA, options).reason == reason
+    assert place_of(used, VIEW, CAMERA, options, prior=prior_at(T_VIEW)).verdict == "ok"
+
+
+@pytest.mark.parametrize(
+    ("T", "covariance"),
+    [
+        (np.diag([2.0, 1.0, 1.0, 1.0]), np.eye(6)),
+        (np.eye(4), -np.eye(6)),
+        (np.eye(4), np.full((6, 6), np.nan)),
+        (np.eye(4), 1e13 * np.eye(6)),
+    ],
+)
+def test_a_prior_that_is_none_is_refused(T, covariance):
+    with pytest.raises(BadRequest, match="prior"):
+        PosePrior(T_map_camera=T, covariance=covariance)
 
 
 def test_a_place_that_looks_alike_only_in_part_does_not_make_it_ambiguous():

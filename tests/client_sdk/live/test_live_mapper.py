@@ -26,8 +26,9 @@ from client_sdk.live.keyframe_sender import make_request
 from client_sdk.wheel_odometry import OdometryReading
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, MissingExtra, UsageError
-from rse_pf.geometry import exp_se3
+from rse_pf.geometry import exp_se3, inverse
 from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe, make_features
+from rse_pf.slam.localise import PosePrior
 from rse_pf.wire import Command, make_codec
 from tests.kit.fake_live_map import FakeLiveRobot, alignment, failing, solve
 from tests.kit.flat_world import CAMERA, STEP_M, covered, foreign, frame_at
@@ -371,6 +372,34 @@ async def test_relocalise_sends_the_next_keyframe_without_a_pause(robot: FakeLiv
         mapper.relocalise()
         await drive(mapper, range(4, 5))
         await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
+
+
+async def test_a_prior_moves_with_the_odometry_until_the_robot_is_localised(robot: FakeLiveRobot) -> None:
+    robot.foreign_keyframes = 50
+    T_expected = exp_se3([7.0, 2.0, 0.0, 0.0, 0.0, 1.0])
+    prior = PosePrior(T_map_camera=T_expected, covariance=np.diag([0.25, 0.25, 0.0, 0.0, 0.0, 0.068]))
+    patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
+    async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
+        (before,) = await drive(mapper, range(1))
+        await robot.until(lambda: len(robot.priors) == 1)
+        robot.relocalised = {"verdict": "ok", "T_map_camera": T_MAP_ODOM.ravel().tolist(), "inliers": 20}
+        mapper.relocalise(prior)
+        (after,) = await drive(mapper, range(1, 2))
+        await robot.until(lambda: mapper.aligned)
+        mapper.relocalise()
+        await drive(mapper, range(2, 3))
+        mapper.relocalise(prior)  # the relocalisation was wrong
+        await drive(mapper, range(3, 4))
+        await robot.until(lambda: len(robot.priors) == 3)
+
+    none, first, again = robot.priors
+    assert none is None
+    assert first is not None
+    assert again is not None
+    assert before.T_world_camera is not None
+    moved = T_expected @ inverse(before.T_world_camera) @ after.T_world_camera
+    np.testing.assert_allclose(np.reshape(first.T_map_camera, (4, 4)), moved, atol=1e-9)
+    assert [number for number in first.covariance if number] == [0.25, 0.25, 0.068]
 
 
 async def test_a_covered_lens_begins_no_segment_and_tracking_continues_after_it(

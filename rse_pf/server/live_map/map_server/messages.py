@@ -19,10 +19,18 @@ from rse_pf.live_map.outcomes import Alignment, Corrected, Outcome
 from rse_pf.maps.registry import MapRecord
 from rse_pf.server.live_map.lease import LeaseRecord
 from rse_pf.server.live_map.map_server.state import MapState
-from rse_pf.slam.localise import Localised
-from rse_pf.wire.live_map import LIVE_REQUESTS, LiveRequest
+from rse_pf.slam.localise import Localised, PosePrior
+from rse_pf.wire.live_map import LIVE_REQUESTS, LiveRequest, PriorPose
 
-__all__ = ["MapUpdates", "decode_request", "paths_reply", "relocalise_reply", "show_reply", "version_reply"]
+__all__ = [
+    "MapUpdates",
+    "decode_prior",
+    "decode_request",
+    "paths_reply",
+    "relocalise_reply",
+    "show_reply",
+    "version_reply",
+]
 
 Payload = dict[str, Any]
 _MAX_PATH_POINTS = 4_000
@@ -55,6 +63,15 @@ def decode_request(operation: str, data: bytes) -> LiveRequest:
             f"the request {operation} is invalid: {message_of(error)}",
             hint="send the fields that docs/protocol.md lists for this service",
         ) from error
+
+
+def decode_prior(prior: PriorPose | None) -> PosePrior | None:
+    """Return the prior of a request ``live-relocalise``; raises BadRequest if it is not valid."""
+    if prior is None:
+        return None
+    covariance = np.zeros((6, 6))
+    covariance[_UPPER_TRIANGLE] = covariance.T[_UPPER_TRIANGLE] = prior.covariance
+    return PosePrior(T_map_camera=np.array(prior.T_map_camera).reshape(4, 4), covariance=covariance)
 
 
 def relocalise_reply(localised: Localised, version: int) -> Payload:

@@ -20,6 +20,7 @@ from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, 
 from rse_pf.server.live_map.map_server.floor_plan import FloorPlanner
 from rse_pf.server.live_map.map_server.log import LogWriter
 from rse_pf.server.live_map.map_server.messages import (
+    decode_prior,
     decode_request,
     paths_reply,
     relocalise_reply,
@@ -177,9 +178,10 @@ class RequestHandler:
 
     async def _relocalise(self, request: LiveRelocalise) -> dict[str, Any]:
         view = decode_keyframe(request.keyframe)
+        prior = decode_prior(request.prior)
         threads, live_map = self._environment.threads, self._state.live_map
         relocalise = await threads.compute(
-            Urgency.ANSWER, functools.partial(live_map.prepare_relocalisation, view)
+            Urgency.ANSWER, functools.partial(live_map.prepare_relocalisation, view, prior)
         )
         position = self._state.position
         return relocalise_reply(await threads.match(relocalise), position)
