@@ -61,9 +61,13 @@ class PlacedKeyframes:
     """Keyframes and their present poses in the map.
 
     ``robots`` are texts of `RobotId.folder`, empty for keyframes of the version that the map started from.
-    ``data`` are the encoded keyframes; ``T_map_camera`` is ``(n, 4, 4)``, metres.
+    ``data`` are the encoded keyframes; ``T_map_camera`` is ``(n, 4, 4)``, metres.  ``arrived`` is the number
+    of keyframes that have arrived, also those that are not placed: all ids are below it.  ``dropped`` are
+    keyframes that are in the map without features.
     """
 
+    arrived: int
+    dropped: frozenset[int]
     ids: tuple[int, ...]
     robots: tuple[str, ...]
     data: tuple[bytes, ...]
@@ -206,16 +210,21 @@ def placed_keyframes(graph: MapGraph) -> PlacedKeyframes:
     Those of segments that are excluded or not metric are left out.  Nothing is decoded, so that this takes
     less than a microsecond for each keyframe.
     """
-    placed = [
-        (i, "" if segment.is_from_version else segment.robot, data)
+    keyframes = [
+        (i, "" if segment.is_from_version else segment.robot, graph.keyframes[i].data)
         for segment in _aligned_segments(graph)
         if segment.is_metric and not segment.is_excluded
         for i in segment.keyframes
-        if (data := graph.keyframes[i].data) is not None
     ]
+    placed = [(i, robot, data) for i, robot, data in keyframes if data is not None]
     ids, robots, datas = zip(*placed, strict=True) if placed else ((), (), ())
     return PlacedKeyframes(
-        ids=ids, robots=robots, data=datas, T_map_camera=graph.T_component_camera[list(ids)]
+        arrived=len(graph),
+        dropped=frozenset(i for i, _, data in keyframes if data is None),
+        ids=ids,
+        robots=robots,
+        data=datas,
+        T_map_camera=graph.T_component_camera[list(ids)],
     )
 
 

@@ -2,8 +2,8 @@
 
 The points of a keyframe are the object that its robot has stored for the cloud of the map; until that is
 there, and for keyframes that have none, they are the features.  A plan is made in a thread of its own, when a
-robot asks and the map has changed: at once if a keyframe has moved by half a cell, otherwise when the last
-plan has the age that the robot permits.
+robot asks and the map has changed: at once if keyframes have moved by half a cell or robots have joined,
+otherwise when the last plan has the age that the robot permits.
 """
 
 from __future__ import annotations
@@ -89,6 +89,10 @@ class FloorPlanner:
         self._newest: dict[GridOptions, _Plan] = {}
         self._recent: dict[str, OccupancyGrid] = {}
         self._views: dict[int, _View] = {}
+        # Keyframes that were in the map at the last request, the number of those that had arrived by then,
+        # and `MapState.changes` when one that had arrived before was found to have joined the map.
+        self._placed: set[int] = set()
+        self._arrived = self._joined_changes = 0
 
     async def answer(self, request: LiveFloorPlan) -> dict[str, Any]:
         """Return the reply of ``live-floor-plan``.
@@ -145,9 +149,13 @@ class FloorPlanner:
             Urgency.ANSWER,
             lambda: (self._state.live_map.placed_keyframes(), self._state.position, self._state.changes),
         )
+        if any(i < self._arrived and i not in self._placed for i in placed.ids):
+            self._joined_changes = changes
+        self._placed, self._arrived = set(placed.ids), placed.arrived
         if plan is not None:
             is_recent = now_s - plan.made_s < max(max_age_s, plan.took_s / _MAX_LOAD)
-            if is_recent and not _is_moved(plan, placed, options):
+            has_joined = plan.changes < self._joined_changes
+            if is_recent and not has_joined and not _is_moved(plan, placed, options):
                 return plan
         make = functools.partial(self._make, placed, options, version, changes)
         try:
@@ -249,12 +257,12 @@ def _thinned(points: Array, count: int) -> _Points:
 
 
 def _is_moved(plan: _Plan, placed: PlacedKeyframes, options: GridOptions) -> bool:
-    """Return whether a keyframe of the plan is gone, or moved by half a cell in a direction."""
-    before = [plan.T_of[i] for i in placed.ids if i in plan.T_of]
-    if len(before) < len(plan.T_of):
+    """Return whether a keyframe of the plan is gone, or moved by half a cell along an axis."""
+    is_in_plan = np.array([i in plan.T_of for i in placed.ids], dtype=bool)
+    if plan.T_of.keys() - placed.dropped - set(placed.ids):
         return True
-    is_in_plan = np.array([i in plan.T_of for i in placed.ids])
-    moved_m = placed.T_map_camera[is_in_plan, :3, 3] - np.array(before)[:, :3, 3]
+    before = np.array([plan.T_of[i] for i in placed.ids if i in plan.T_of]).reshape(-1, 4, 4)
+    moved_m = placed.T_map_camera[is_in_plan, :3, 3] - before[:, :3, 3]
     return bool(np.abs(moved_m).max(initial=0.0) > options.resolution_m / 2)
 
 

@@ -24,7 +24,7 @@ from rse_pf.storage.object_store import MemoryStore
 from tests.kit.generated_drives import CAMERA, GeneratedDrive, GeneratedWorld, straight
 from tests.kit.map_server_setup import MapServerSetup, RunningMapServer
 
-ONE, OTHER = RobotId("default", "one"), RobotId("default", "other")
+ONE, OTHER, ROBOT = (RobotId("default", name) for name in ("one", "other", "third"))
 UP = (0.0, -1.0, 0.0)  # the map has the axes of the first camera, whose y axis points down
 CAMERA_M = 1.2  # height of the camera above the floor
 SEEN_M = 3.5  # distance up to which a camera sees
@@ -169,6 +169,26 @@ async def test_a_map_that_only_grows_has_a_new_plan_after_the_age_that_the_robot
     assert (await hall.ask())["plan"] == first
     hall.setup.clock.jump(61.0)
     assert (await hall.ask())["plan"] != first
+
+
+async def test_a_robot_that_joins_the_map_is_in_the_plan_at_once() -> None:
+    hall = await Hall().start()  # cells are so large that no keyframe moves by half of one
+    before = await hall.ask(resolution_m=0.5)
+    apart = hall.world.drive(ROBOT.folder, straight(2.0, 4.0))
+    for number in range(len(apart.T_world_camera)):
+        hall.live_map.apply(hall.world.keyframe(apart, number))
+    longer = hall.world.drive(OTHER.folder, straight(1.0, 5.2))
+    hall.live_map.apply(hall.world.keyframe(longer, len(hall.drives[1].T_world_camera)))
+    hall.server.state.changes += 1
+    assert (await hall.ask(resolution_m=0.5))["version"] == before["version"]
+
+    first = len(hall.world.seen) - len(apart.T_world_camera) - 1
+    for keyframe in range(first, first + len(apart.T_world_camera)):
+        hall.live_map.apply(hall.world.links_of(keyframe))
+    assert hall.live_map.alignment_of(ROBOT.folder, 0).aligned
+    hall.server.state.position += 1
+    hall.server.state.changes += 1
+    assert (await hall.ask(resolution_m=0.5))["version"] > before["version"]
 
 
 async def test_points_that_arrive_late_are_in_the_next_plan() -> None:
