@@ -145,8 +145,9 @@ class FloorPlanner:
         is_complete = all(view.source is None or view.due_s > now_s for view in self._views.values())
         if plan is not None and plan.changes == self._state.changes and is_complete:
             return plan
+        # This takes a millisecond, and must not wait until a map that is busy has no more entries to apply.
         placed, version, changes = await threads.compute(
-            Urgency.ANSWER,
+            Urgency.APPLY,
             lambda: (self._state.live_map.placed_keyframes(), self._state.position, self._state.changes),
         )
         if any(i < self._arrived and i not in self._placed for i in placed.ids):
