@@ -25,6 +25,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper
 from client_sdk.robot import Robot
+from client_sdk.tracking.segment_join import NOT_JOINED
 from client_sdk.wheel_odometry import OdometryReading
 from ros_bridge.access import connect_robot
 from ros_bridge.base_poses import BasePoses
@@ -150,6 +151,7 @@ class Bridge:
         self._fed_ns: int | None = None
         self._status: PoseStatus | None = None
         self._frame_status: PoseStatus = "lost"
+        self._is_elsewhere = False
         self._frame_s = self._lost_since_s = clock()
         self._odometry_seen: tuple[int | None, float] = (None, float("-inf"))
         self._uses_ros_clock = True
@@ -304,7 +306,8 @@ class Bridge:
         del self.track_s[:-10_000]
         self.frames += 1
         self._stamp_ns, self._frame_s = images.stamp_ns, self._clock()
-        is_visual = tracked.pose_source == "visual"
+        self._is_elsewhere = tracked.reason == NOT_JOINED
+        is_visual = tracked.pose_source == "visual" and not self._is_elsewhere
         self._reason = "" if is_visual else tracked.reason
         self.lost_frames += not is_visual
         self._publish_poses(mapper, tracked, images.stamp_ns)
@@ -371,7 +374,8 @@ class Bridge:
         self._update_status()
         if pose is None:
             return
-        self._outgoing.extend_path(stamp_ns, pose.T_world_base)
+        if not self._is_elsewhere:
+            self._outgoing.extend_path(stamp_ns, pose.T_world_base)
         if not self._frames.is_odometry_foreign and pose.T_odom_base is not None:
             self._publish_transforms([self._frames.odom_transform(stamp_ns, pose.T_odom_base)])
         for message in self._outgoing.of_pose(pose, stamp_ns):
@@ -454,6 +458,7 @@ class Bridge:
         is_carried = (
             self._frames.is_odometry_foreign
             and self._poses.is_odom_known
+            and not self._is_elsewhere
             and now - self._odometry_seen[1] <= _ODOMETRY_STALE_S
         )
         status: PoseStatus = self._frame_status if now - self._frame_s <= _STALE_S else "lost"
@@ -470,10 +475,11 @@ class Bridge:
     ) -> tuple[Array | None, Array | None]:
         """Return the pose ``(4, 4)`` of the mapper's world in the map and its covariance ``(6, 6)``.
 
-        Both may be None with a live map.  A robot with a map of its own has the identity and None.
+        Both may be None with a live map.  A robot with a map of its own has the identity and None, or twice
+        None while it is at a place that is not connected with the map.
         """
         if not isinstance(mapper, LiveMapper):
-            return _IDENTITY, None
+            return None if self._is_elsewhere else _IDENTITY, None
         T_map_world, pose = mapper.T_map_odom, tracked.T_world_camera
         if T_map_world is None and pose is not None and tracked.T_map_camera is not None:
             # The segment is not aligned yet, and continues one that is: the wheels have carried the pose.

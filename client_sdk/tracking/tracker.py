@@ -121,6 +121,7 @@ class _TrackState:
         lost_in_a_row: Number of frames without a pose since the last accepted one.
         unrecognised: Number of frames since the last accepted pose that show enough features and no known
             place.
+        still_unrecognised: The number of these at which the wheels had hardly moved since that pose.
         segment: Number of the present segment, -1 before the first.
         join_candidate: Where the present segment may lie in another one; None without a measurement.
     """
@@ -134,6 +135,7 @@ class _TrackState:
     keyframe_inliers: int = 0
     lost_in_a_row: int = 0
     unrecognised: int = 0
+    still_unrecognised: int = 0
     segment: int = -1
     join_candidate: JoinCandidate | None = None
 
@@ -229,6 +231,8 @@ class Tracker:
         self._connections: dict[int, tuple[WheelConnection, ...]] = {}
         """Motions by wheels between the world of a segment and that of its anchor: several once a segment
         between them was joined."""
+        self._elsewhere: set[int] = set()
+        """Segments that may begin anywhere: the robot was carried to them, as the images tell."""
         self._has_pose = False
         self._has_missing_answer = False
         self._adjusted_frames = 0
@@ -290,6 +294,7 @@ class Tracker:
         self._segments.clear()
         self._anchors.clear()
         self._connections.clear()
+        self._elsewhere.clear()
         self._next_segment = 0
         self._has_pose = timestamp_s is not None
         self._state = _TrackState(
@@ -648,6 +653,8 @@ class Tracker:
                 reach = Reach(T_carried[:3, 3], motion.reach_m)
                 position = posed.T_world_camera[:3, 3]
                 return reach.excess(position) <= REACH_DEPTH_SHARE * attempt.distance_to(position)
+        if attempt.segment != self._state.segment and self._may_be_anywhere(attempt.segment):
+            return True
         position, own = posed.T_world_camera[:3, 3], self._map.trajectory()
         if not self._state.lost_in_a_row and self._is_near(posed.T_world_camera, attempt):
             return True
@@ -657,6 +664,11 @@ class Tracker:
             path = self._segments[attempt.segment].trajectory()
             reach = reach_between(path, own, self._frame.timestamp_s)
         return reach.excess(position) <= REACH_DEPTH_SHARE * attempt.distance_to(position)
+
+    def _may_be_anywhere(self, other: int) -> bool:
+        """Return whether the robot was carried by hand between another segment and the present one."""
+        roots = {root_of(self._anchors, number) for number in (other, self._state.segment)}
+        return bool(self._elsewhere & roots)
 
     def _looks_right(self, T_world_camera: Array, segment: int) -> bool:
         """Return whether the image looks as a pose in a segment predicts; True for a user's features."""
@@ -807,6 +819,7 @@ class Tracker:
             keyframe_inliers=keyframe_inliers,
             lost_in_a_row=0,
             unrecognised=0,
+            still_unrecognised=0,
         )
         return is_keyframe
 
@@ -831,22 +844,32 @@ class Tracker:
         depth.  A later one begins at the last accepted pose, with a frame of at least three times as many
         features with depth, once more than ``segment_after`` such frames without a pose came since then.
         Where wheels have carried the pose, it begins there, and earlier; frames whose queries nobody has
-        answered do not count.
+        answered do not count.  If images show another place while the wheels stand still, the robot was
+        carried away, or something hides the view: the wheels do not tell then where the segment begins.
         """
         feature_count = int(np.isfinite(view.features.points_camera[:, 2]).sum())
         factor = _BEGIN_DEPTHS_FACTOR if self._segments else 1
         if feature_count < factor * self.options.min_inliers:
             return self._lose(match_count)
-        T_carried, motion = self._carry()
+        (T_carried, motion), is_elsewhere = self._carry(), False
         if self._segments:
             if motion is not None and self._has_missing_answer:
                 return self._lose(match_count)
-            self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
+            is_still = motion is not None and motion.is_still
+            self._state = replace(
+                self._state,
+                unrecognised=self._state.unrecognised + 1,
+                still_unrecognised=self._state.still_unrecognised + is_still,
+            )
             after = self.options.segment_after
+            if self._state.still_unrecognised >= carried_segment_after(after):
+                motion, is_elsewhere = None, True
             if self._state.unrecognised <= (after if motion is None else carried_segment_after(after)):
                 return self._lose(match_count)
         is_continued = bool(self._segments) or motion is not None
         start = T_carried if is_continued else self._T_world_start
+        if is_elsewhere:
+            self._elsewhere.add(self._next_segment)
         return self._begin_segment(view, start, feature_count, motion)
 
     def _begin_segment(
@@ -989,6 +1012,8 @@ class Tracker:
         *T_other_present* is ``(4, 4)``, the position ``(3,)``.
         """
         present = self._state.segment
+        if self._may_be_anywhere(other):
+            return Reach(np.zeros(3), math.inf), np.zeros(3)
         older, newer = (self._segments[number].trajectory() for number in sorted((other, present)))
         T_older_newer = T_other_present if other < present else inverse(T_other_present)
         return reach_at_begin(older, newer), transform(T_older_newer, newer.positions[:1])[0]
@@ -999,6 +1024,7 @@ class Tracker:
         *T_into_segment* ``(4, 4)`` is the pose of the newer segment's world in that of the older one.
         """
         segment_map = self._segments.pop(segment)
+        self._elsewhere.discard(segment)
         segment_map.move(T_into_segment)
         first_landmark = self._segments[into].append(segment_map)
         self.joins.append(Join(segment, into, T_into_segment))

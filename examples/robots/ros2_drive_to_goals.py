@@ -21,7 +21,7 @@ class Driver:
 
     def __init__(self) -> None:
         import rclpy
-        from geometry_msgs.msg import PoseStamped, Twist
+        from geometry_msgs.msg import PoseStamped, TwistStamped
         from nav_msgs.msg import OccupancyGrid as GridMessage
         from nav_msgs.msg import Odometry
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -30,13 +30,13 @@ class Driver:
 
         self.node = rclpy.create_node("drive_to_goals")
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._commands = self.node.create_publisher(Twist, "/cmd_vel", 10)
+        self._commands = self.node.create_publisher(TwistStamped, "/cmd_vel", 10)
         self._reached = self.node.create_publisher(Bool, "/goal_reached", 10)
         self.node.create_subscription(PoseStamped, "/goal_pose", self._on_goal, latched)
         self.node.create_subscription(GridMessage, "/rse_pf/floor_plan", self._on_plan, latched)
         self.node.create_subscription(String, "/rse_pf/status", self._on_status, latched)
         self.node.create_subscription(TFMessage, "/tf", self._on_transforms, 50)
-        self.node.create_subscription(Odometry, "/odom", self._on_odometry, 50)
+        self.node.create_subscription(Odometry, "/odom", self._on_odometry, 1)
         self._plan: OccupancyGrid | None = None
         self._T_map_odom: Array | None = None
         self._status = "lost"
@@ -70,7 +70,7 @@ class Driver:
                 self._T_map_odom = pose_of(moved, turned)
 
     def _on_odometry(self, message) -> None:
-        from geometry_msgs.msg import Twist
+        from geometry_msgs.msg import TwistStamped
         from std_msgs.msg import Bool
 
         navigator, plan = self._navigator, self._plan
@@ -84,9 +84,9 @@ class Driver:
             self._planned_s = now_s
             navigator.replan(plan, x_m, y_m)
         command = navigator.command(x_m, y_m, yaw_of(T_map_base), self._status)
-        twist = Twist()
-        twist.linear.x, twist.angular.z = command or (0.0, 0.0)
-        self._commands.publish(twist)
+        stamped = TwistStamped(header=message.header)
+        stamped.twist.linear.x, stamped.twist.angular.z = command or (0.0, 0.0)
+        self._commands.publish(stamped)
         if command is None:
             self._navigator = None
             self._reached.publish(Bool(data=True))

@@ -3,7 +3,7 @@
 The robot drives through a rendered building.  First it is driven along a tour, so that a map is made; then it
 sends goals to /goal_pose, waits for /goal_reached, and prints how far from each goal the robot truly is.
 Goals are places in the map, as if they were clicked there: where the map lies in the building is found by the
-path of the tour.  Time is simulated, and waits for the poses of the bridge.  Needs a ROS 2 (rclpy);
+path of the tour.  Time is simulated, and waits for poses and commands.  Needs a ROS 2 (rclpy);
 pip install 'rse-pf[ros2]' installs one.
 """
 
@@ -31,8 +31,8 @@ COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image
 INFO = "/camera/color/camera_info"
 CAMERA_FRAME = "camera_color_optical_frame"
 START_S = 10.0  # time of the first image: a time of 0 means in ROS that there is no clock yet
-POSE_WAIT_S = 1.0  # longest wait for the pose of an image, in real seconds
-COMMAND_S = 0.5  # a command that is older stops the robot, as the drivers of real bases do
+ANSWER_WAIT_S = 1.0  # longest wait for a pose and a command, in real seconds
+COMMAND_S = 0.5  # a command with an older stamp stops the robot, as the drivers of real bases do
 GOAL_S = 150.0  # longest simulated time for a goal
 REACHED_M, REACHED_DEG = 0.15, 10.0  # largest true errors of position and direction at a goal that is reached
 WRONG_M = 0.2  # a pose by the camera with a larger error is counted as wrong
@@ -55,7 +55,7 @@ class Robot:
 
     def __init__(self, args: argparse.Namespace) -> None:
         import rclpy
-        from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+        from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped
         from nav_msgs.msg import Odometry, Path
         from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
         from rosgraph_msgs.msg import Clock
@@ -72,7 +72,7 @@ class Robot:
         self._images = {topic: publisher(Image, topic, qos_profile_sensor_data) for topic in (COLOUR, DEPTH)}
         self._infos = publisher(CameraInfo, INFO, qos_profile_sensor_data)
         self._goals = publisher(PoseStamped, "/goal_pose", latched)
-        subscribe(Twist, "/cmd_vel", self._on_command, 10)
+        subscribe(TwistStamped, "/cmd_vel", self._on_command, 10)
         subscribe(Bool, "/goal_reached", self._on_goal_reached, 10)
         subscribe(String, "/rse_pf/status", self._on_status, latched)
         subscribe(PoseWithCovarianceStamped, "/rse_pf/pose", self._on_pose, 10)
@@ -92,6 +92,7 @@ class Robot:
         self._path: dict[int, tuple[float, float]] = {}
         self._newest_pose_ns = 0
         self._prints_times = args.times
+        self._has_goal = False
         self.says_reached = False
         self.wrong_poses = 0
         self._statics.publish(
@@ -148,10 +149,12 @@ class Robot:
         message.pose.orientation.z, message.pose.orientation.w = math.sin(goal[2] / 2), math.cos(goal[2] / 2)
         self.says_reached = False
         begin_s = self.time_s
+        self._has_goal = True
         self._goals.publish(message)
         while not self.says_reached and self.time_s < begin_s + GOAL_S:
             is_fresh = self.time_s - self._commanded_s <= COMMAND_S
             self._advance(*self.base.step(*(self._command if is_fresh else (0.0, 0.0))))
+        self._has_goal = False
         return self.time_s - begin_s
 
     def carry_away(self, rng: np.random.Generator) -> None:
@@ -184,7 +187,7 @@ class Robot:
             print(f"time {self.time_s:.0f} s", flush=True)
 
     def _observe(self) -> None:
-        """Publish an image with depth, and wait for its pose for a limited time."""
+        """Publish an image with depth, and wait a limited time for its pose and for the next command."""
         from sensor_msgs.msg import CameraInfo, Image
 
         self._publish_odometry()
@@ -204,9 +207,14 @@ class Robot:
             image = Image(header=info.header, width=info.width, height=info.height, encoding=encoding)
             image.step, image.data = pixels.strides[0], pixels.tobytes()
             self._images[topic].publish(image)
-        until_s = time.monotonic() + POSE_WAIT_S
-        while self._newest_pose_ns < stamp_ns and (left_s := until_s - time.monotonic()) > 0.0:
+        until_s = time.monotonic() + ANSWER_WAIT_S
+        while not self._is_answered(stamp_ns) and (left_s := until_s - time.monotonic()) > 0.0:
             self._spin_once(self.node, timeout_sec=left_s)
+
+    def _is_answered(self, stamp_ns: int) -> bool:
+        """Return whether the pose of an image has come, and on the way to a goal a command after it."""
+        is_commanded = not self._has_goal or self.says_reached or self._commanded_s > 1e-9 * stamp_ns - 1e-6
+        return self._newest_pose_ns >= stamp_ns and is_commanded
 
     def _publish_clock(self) -> None:
         from rosgraph_msgs.msg import Clock
@@ -246,7 +254,8 @@ class Robot:
         return Time(sec=seconds, nanosec=nanoseconds)
 
     def _on_command(self, message) -> None:
-        self._command, self._commanded_s = (message.linear.x, message.angular.z), self.time_s
+        twist, stamp = message.twist, message.header.stamp
+        self._command, self._commanded_s = (twist.linear.x, twist.angular.z), stamp.sec + 1e-9 * stamp.nanosec
 
     def _on_goal_reached(self, message) -> None:
         self.says_reached = message.data

@@ -40,7 +40,7 @@ from tests.kit.bridge_runs import (
     send_transforms,
     stamp_of,
 )
-from tests.kit.flat_world import STEP_M, covered, frame_at
+from tests.kit.flat_world import STEP_M, covered, foreign, frame_at
 
 ROWS = 6
 LEVEL = GridOptions(up=(0.0, 0.0, 1.0))
@@ -344,6 +344,29 @@ async def test_while_the_camera_fails_the_wheels_carry_the_pose_and_the_status_s
     distance_m, angle_deg = pose_difference(heard.transforms("map", "odom")[-1][1], inverse(ODOM_START))
     assert distance_m < 0.01
     assert angle_deg < 0.2
+
+
+async def test_a_robot_that_was_carried_away_is_lost_although_its_wheels_report() -> None:
+    heard = Heard()
+
+    def before(bridge: Bridge) -> None:
+        send_transforms(bridge, "tf_static", [(START_NS, "base_link", "eye", CAMERA_AXES)])
+
+    options = {"base_frame": "base_link", "odometry": "odom", "queue_frames": 20}
+    async with running(heard, before=before, **options) as bridge:
+        for row in range(20):
+            for part in range(-4, 2):
+                stamp_ns = START_NS + row * STEP_NS + part * STEP_NS // 5
+                send_odometry(bridge, stamp_ns, ODOM_START, ("odom", "base_link"))
+            frame = frame_at(row, depth=True)
+            send(bridge, frame if row < 4 else foreign(frame), row)
+        await heard.until(count_of(STRING, 4))
+        statuses = heard.of(STRING)
+        heard.messages.clear()
+        await heard.until(count_of(DIAGNOSTICS, 1))
+
+    assert [each.data for each in statuses] == ["lost", "visual", "odometry", "lost"]
+    assert "not joined" in heard.of(DIAGNOSTICS)[-1].status[0].message
 
 
 async def test_without_wheels_a_covered_camera_is_lost() -> None:

@@ -16,7 +16,7 @@ from client_sdk.mapper import Mapper
 from client_sdk.wheel_odometry import OdometryReading
 from rse_pf.errors import Busy, UsageError
 from tests.kit.fake_live_map import solve
-from tests.kit.flat_world import STEP_M, frame_at
+from tests.kit.flat_world import STEP_M, foreign, frame_at
 from tests.kit.wheeled_drives import (
     T_BASE_CAMERA,
     WheeledDrive,
@@ -148,6 +148,27 @@ def test_a_place_that_looks_like_an_earlier_one_is_not_recognised_where_the_whee
     assert base_errors_m(alone, drive)[-1] > 1.0
     assert done[-1].pose_source == "odometry"
     assert base_errors_m(done, drive)[-1] < 0.2
+
+
+async def test_a_robot_that_is_carried_while_its_wheels_stand_is_not_taken_for_where_it_was() -> None:
+    mapper = Mapper(ask=solve, T_base_camera=MOUNT)
+    for row in range(20):
+        await mapper.track(frame_at(row, depth=True), odometry=[sideways(row)])
+
+    # An unknown place, along which the robot drives after a while, and then the known one.
+    away = [(foreign(frame_at(40, depth=True)), 19)] * 15
+    away += [(foreign(frame_at(40 - n, depth=True)), 19 + n) for n in range(15)]
+    back = [(frame_at(5, depth=True), 33)] * 10
+    tracked = []
+    for n, (shown, driven) in enumerate(away + back, 20):
+        reading = OdometryReading(timestamp_s=n / 10, T_odom_base=sideways(driven).T_odom_base)
+        tracked.append(await mapper.track(replace(shown, timestamp_s=n / 10), odometry=[reading]))
+
+    assert not [each for each in tracked[: len(away)] if each.pose_source == "visual" and not each.reason]
+    last = tracked[-1]
+    assert (last.pose_source, last.reason) == ("visual", "")
+    assert last.T_world_base is not None
+    assert last.T_world_base[:3, 3] == pytest.approx((0.0, -5 * STEP_M, 0.0), abs=0.02)
 
 
 def test_frames_that_the_platform_does_not_answer_begin_no_segment() -> None:
