@@ -38,6 +38,7 @@ _SIGHTS = (
 _MAX_LINES = 10_000  # lines of sight of a plan, which take a third of its CPU time
 _MAX_POINTS = 1_500_000  # points of a plan, which bounds its CPU time; of more, an even selection is used
 _READING_S = 0.2  # longest time for which a plan waits for stored points; the next plan reads on
+_AT_ONCE_S = float("-inf")  # time at which an object is due that was not looked for yet
 _FIRST_WAIT_S = 1.0  # time after which a missing object is looked for again; it doubles each time
 _MAX_WAIT_S = 600.0  # an object that is still missing after a wait of this length counts as never stored
 _MAX_LOAD = 0.25  # largest share of a core that plans of a growing map take, without those after corrections
@@ -62,7 +63,7 @@ class _View:
     points: _Points
     sights: _Points
     source: PointSource | None
-    due_s: float = float("-inf")
+    due_s: float = _AT_ONCE_S
     wait_s: float = _FIRST_WAIT_S
 
 
@@ -154,6 +155,8 @@ class FloorPlanner:
             self._joined_changes = changes
         self._placed, self._arrived = set(placed.ids), placed.arrived
         if plan is not None:
+            if any(view.source is not None and view.due_s == _AT_ONCE_S for view in self._views.values()):
+                max_age_s = 0.0  # the last plan had no time to read all that its robots have stored
             is_recent = now_s - plan.made_s < max(max_age_s, plan.took_s / _MAX_LOAD)
             has_joined = plan.changes < self._joined_changes
             if is_recent and not has_joined and not _is_moved(plan, placed, options):
