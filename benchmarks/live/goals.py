@@ -8,7 +8,8 @@ the bridge.  After a tour through the building that makes the map, each goal is 
 
 ``--fault`` happens once for each goal, soon after it was sent: ``kill`` kills the server of the robot,
 ``network`` stops the balancer for 10 s of the simulated time, and ``carried`` puts the robot into another
-place before the goal is sent, without a turn of its wheels.
+place before the goal is sent, without a turn of its wheels.  With ``corrected`` a second robot, of the SDK,
+drives through the building from the first goal on, in a live map of both.
 
 A goal is reached if the robot says so within 150 s and stands within 15 cm and 10 degrees of it.  A pose is
 wrong if the bridge calls it ``visual`` and it is more than 20 cm off, in a map that is laid over the building
@@ -28,6 +29,9 @@ from typing import Annotated, Any
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import spread
+from benchmarks.maps.wheels import make_drive
+from client_sdk import connect
+from client_sdk.simulator.base import T_BASE_CAMERA
 from client_sdk.simulator.building import BUILDINGS
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
@@ -36,9 +40,10 @@ from rse_pf.local.control.platform import LocalPlatform
 from tests.kit.ros2 import ROS2, Ros2
 from tests.kit.ros_programs import Program
 
-FAULTS = ("none", "kill", "network", "carried")
+FAULTS = ("none", "kill", "network", "carried", "corrected")
 EXAMPLES = Path(__file__).parents[2] / "examples" / "robots"
 FAULT_AFTER_S = 3.0  # simulated time from a goal to its fault: the robot drives by then
+SECOND_DRIVE_M = 60.0  # length of the drive of the robot that corrects the map
 OUTAGE_S = 10.0  # simulated time of an outage of the network
 TIMEOUT_S = 3600.0  # longest real time of a tour, and of a goal, on a busy machine
 
@@ -83,7 +88,8 @@ async def _drive(
             ros2.start(
                 ros2.python, "-m", "ros_bridge", "ros2", "--url", platform.url,
                 "--token-file", str(token_file), "--odometry=/odom", "--planar=true",
-                "--floor-plan-every-s=2", "--ros-args", "-p", "use_sim_time:=true",
+                "--floor-plan-every-s=2", "--cloud-every-s=60",
+                *(["--map=hall"] if fault == "corrected" else []), "--ros-args", "-p", "use_sim_time:=true",
             )  # fmt: skip
             ros2.start(ros2.python, str(EXAMPLES / "ros2_drive_to_goals.py"))
             carried = ["--carried", *map(str, range(goals))] if fault == "carried" else []
@@ -91,15 +97,34 @@ async def _drive(
                 ros2.python, str(EXAMPLES / "ros2_simulated_robot.py"), "--building", building,
                 "--tour", str(tour), "--goals", str(goals), "--seed", str(seed), "--times", *carried,
             )  # fmt: skip
+            second = None
             for number in range(goals):
                 await _wait(simulator, f"goal {number} at ")
+                if fault == "corrected" and second is None:
+                    second = asyncio.create_task(_drive_second_robot(platform, building, seed))
                 if fault in ("kill", "network"):
                     await _break(platform, simulator, fault)
                 await _wait(simulator, f"goal {number} [rMG]")
                 say(_goals(simulator.lines)[-1].string.strip())
+            if second is not None:
+                say(await second)
     finally:
         ros2.end()
     return _figures(simulator.lines)
+
+
+async def _drive_second_robot(platform: LocalPlatform, building: str, seed: int) -> str:
+    """Drive a robot of the SDK through the building, in the live map; return what became of it."""
+    number = BUILDINGS.index(building) + len(BUILDINGS) * (seed + 1)
+    second = await asyncio.to_thread(make_drive, number, SECOND_DRIVE_M)
+    poses = 0
+    async with (
+        connect(platform.url, token=platform.issue_token("robot-2")) as robot,
+        robot.live_map("hall", depth=True, T_base_camera=T_BASE_CAMERA) as live,
+    ):
+        for frame, readings in zip(second.frames, second.readings(), strict=True):
+            poses += (await live.track(frame, odometry=readings)).T_map_camera is not None
+    return f"robot-2: {poses} of {len(second.frames)} frames with a pose in the map"
 
 
 async def _wait(simulator: Program, pattern: str) -> None:

@@ -78,7 +78,7 @@ class Robot:
         subscribe(PoseWithCovarianceStamped, "/rse_pf/pose", self._on_pose, 10)
         subscribe(Path, "/rse_pf/path", self._on_path, 10)
 
-        self._building = make_building(args.building, args.seed % 10)
+        self._building = make_building(args.building, 0)
         self._renderer = Renderer(self._building.world, BASE_CAMERA)
         self._tour = drive_route(self._building, self._building.route(args.seed, max(args.tour, 10.0)))
         self.base = DifferentialBase(self._building, *self._start_of_tour())
