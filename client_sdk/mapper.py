@@ -61,7 +61,7 @@ from rse_pf.geometry import Array, Camera, orthonormalise
 from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.inertial import KeyframeImu, upright_rotation
-from rse_pf.slam.occupancy import GridOptions, OccupancyGrid, make_occupancy_grid
+from rse_pf.slam.occupancy import GridOptions, OccupancyGrid, level_map, make_occupancy_grid
 
 __all__ = ["Mapper"]
 
@@ -463,7 +463,8 @@ class Mapper:
     def floor_plan(self, options: GridOptions | None = None) -> OccupancyGrid:
         """Return the floor plan of segment 0 so far: which cells are occupied, free or unknown.
 
-        It takes about a second for a drive of 100 m; call it in a thread.
+        It takes about a second for a drive of 100 m; call it in a thread.  With *T_base_camera* the floor is
+        where the wheels stand: heights are measured from the base at the nearest keyframe.
 
         Args:
             options: Size of the cells, heights of robot and floor, and the direction up.  None: cells of
@@ -472,7 +473,10 @@ class Mapper:
         Raises:
             UsageError: There is no keyframe in metres (see `encoded_map`), or the map shows no floor.
         """
-        return make_occupancy_grid(self._map_version(), options or GridOptions(), max_lines=_MAX_PLAN_LINES)
+        version = self._map_version()
+        if self._wheels is not None and self._is_upright:
+            version = level_map(version, self._wheels.T_base_camera)
+        return make_occupancy_grid(version, options or GridOptions(), max_lines=_MAX_PLAN_LINES)
 
     def save(self, folder: Path) -> dict[str, Any]:
         """Write ``map.ply``, ``trajectory.txt`` and ``report.json`` to a folder; return the report.

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, transform
+from rse_pf.geometry import Array, inverse, planar_pose, transform
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.inertial import upright_rotation
 from rse_pf.slam.level_surfaces import UpSource, estimate_up
@@ -57,6 +57,10 @@ floor is then a median of points, which is finer."""
 _AREA_CELL_M = 0.1  # edge in metres of the squares whose number measures the area of a horizontal layer
 _FLOOR_SHARE = 0.3
 """The floor is the lowest layer whose area is at least this share of the area of the largest layer."""
+_LEVEL_SQUARE_M = 0.25
+"""Edge of the squares of which all points move with the same keyframe where a map is levelled: much smaller
+than the distance over which a drift of the height matters."""
+_SQUARES_AT_ONCE = 4096  # squares that are compared with all keyframes in one array operation; bounds memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,6 +235,42 @@ def grid_of_points(
         up_source=up_source,
         points_left_out=points_left_out,
     )
+
+
+def level_map(version: MapVersion, T_base_camera: Array) -> MapVersion:
+    """Return a map in which the base of the robot stands level, at one height, at each keyframe.
+
+    A robot on wheels stands on the floor: where its base is estimated above it or tilted, because the pose
+    has drifted or on a ramp, the floor around it is, too.  Each point gets the height that it has above the
+    base at the nearest keyframe; x and y of points and bases stay.
+
+    Args:
+        version: The map, whose z axis points up, with keyframes.
+        T_base_camera: ``(4, 4)``, metres: mount of the camera on the base.
+    """
+    # 1. Level the base at each keyframe, at the height of the first one.
+    T_world_camera = np.array([keyframe.T_world_camera for keyframe in version.keyframes])
+    T_world_base = T_world_camera @ inverse(T_base_camera)
+    T_world_level = np.array(
+        [planar_pose(pose[0, 3], pose[1, 3], math.atan2(pose[1, 0], pose[0, 0])) for pose in T_world_base]
+    )
+    T_world_level[:, 2, 3] = T_world_base[0, 2, 3]
+    keyframes = tuple(
+        replace(keyframe, T_world_camera=pose)
+        for keyframe, pose in zip(version.keyframes, T_world_level @ T_base_camera, strict=True)
+    )
+    # 2. Find the nearest keyframe of each square that has points.
+    points = version.points.astype(np.float64)
+    squares, square = np.unique(np.floor(points[:, :2] / _LEVEL_SQUARE_M), axis=0, return_inverse=True)
+    nearest = np.zeros(len(squares), dtype=np.int64)
+    for first in range(0, len(squares), _SQUARES_AT_ONCE):
+        part = slice(first, first + _SQUARES_AT_ONCE)
+        middles = (squares[part] + 0.5) * _LEVEL_SQUARE_M
+        nearest[part] = np.linalg.norm(middles[:, None] - T_world_base[:, :2, 3], axis=2).argmin(axis=1)
+    # 3. Give each point its height above the base there.
+    heights = (T_world_level @ inverse(T_world_base))[:, 2][nearest[square.reshape(-1)]]
+    points[:, 2] = (heights[:, :3] * points).sum(axis=1) + heights[:, 3]
+    return replace(version, keyframes=keyframes, points=points.astype(np.float32))
 
 
 def _find_up(version: MapVersion, options: GridOptions) -> tuple[Array, UpSource]:

@@ -18,6 +18,7 @@ from rse_pf.slam.occupancy import (
     UNKNOWN,
     GridOptions,
     OccupancyGrid,
+    level_map,
     make_occupancy_grid,
 )
 from tests.kit.exact_maps import CAMERA, shares_right, world_map
@@ -138,6 +139,22 @@ def test_a_look_frees_what_it_passes_at_the_height_of_the_robot_alone() -> None:
     assert at(grid, 2.8, 2.0) == FREE
     assert at(grid, 3.52, 2.0) == OCCUPIED
     assert at(above, 2.4, 2.0) == UNKNOWN
+
+
+def test_a_base_whose_height_and_tilt_have_drifted_stands_on_the_floor() -> None:
+    T_base_camera = room().keyframes[0].T_world_camera.copy()
+    T_base_camera[:2, 3] = 0.0
+    drift = exp_se3(np.array([0.0, 0.0, 0.3, 0.02, -0.03, 0.0]))
+    drifted = room(T=drift)
+    unlevel = make_occupancy_grid(drifted, replace(UP, floor_m=0.0))
+
+    grid = make_occupancy_grid(level_map(drifted, T_base_camera), UP)
+
+    assert at(unlevel, 0.5, 3.6) == OCCUPIED
+    assert [at(grid, x, 2.0) for x in (0.3, 1.0, 1.8)] == [FREE] * 3
+    assert [at(grid, 0.5, y) for y in (0.4, 2.0, 3.6)] == [FREE] * 3
+    assert at(grid, 1.25, 3.25) == OCCUPIED
+    assert OCCUPIED in {at(grid, x, 2.0) for x in np.arange(3.45, 3.58, 0.03)}
 
 
 def test_a_map_that_knows_gravity_is_turned_and_the_file_says_how() -> None:
