@@ -261,13 +261,13 @@ def _thinned(points: Array, count: int) -> _Points:
 
 
 def _is_moved(plan: _Plan, placed: PlacedKeyframes, options: GridOptions) -> bool:
-    """Return whether a keyframe of the plan is gone, or moved by half a cell along an axis."""
+    """Return whether a keyframe of the plan is gone, or moved by half a cell."""
     is_in_plan = np.array([i in plan.T_of for i in placed.ids], dtype=bool)
     if plan.T_of.keys() - placed.dropped - set(placed.ids):
         return True
     before = np.array([plan.T_of[i] for i in placed.ids if i in plan.T_of]).reshape(-1, 4, 4)
     moved_m = placed.T_map_camera[is_in_plan, :3, 3] - before[:, :3, 3]
-    return bool(np.abs(moved_m).max(initial=0.0) > options.resolution_m / 2)
+    return bool(np.linalg.norm(moved_m, axis=1).max(initial=0.0) >= options.resolution_m / 2)
 
 
 def _id_of(grid: OccupancyGrid) -> str:
