@@ -24,6 +24,7 @@ RUNS = {
     "data.kills": (["--kills", "6"], "acknowledged"),
     "hostile.one_tenant": (["--pairs", "1", "--seconds", "3", "--only", "leave"], "leave.p99_ms.pose.0"),
     "hostile.tenants": (["--commands", "300"], "commands.acme"),
+    "live.floor_plan": (["--robots", "1", "--length-m", "6"], "rounds.0.right_percent.all"),
     "live.one_process": (["growth", "--keyframes", "300"], "wide.keyframes"),
     "maps.wheels": (
         ["--only", "drives", "covers", "--drives", "1", "--covers", "1", "--length-m", "6"],
