@@ -234,6 +234,7 @@ async def _round(building: str, seeds: list[int], length_m: float, rate_hz: floa
         pipe, child = context.Pipe()
         process = context.Process(target=run_robot, args=(number, building, length_m, seed, child))
         process.start()
+        child.close()  # so that the end of a robot that fails is noticed
         pipes.append(pipe)
         processes.append(process)
     try:
