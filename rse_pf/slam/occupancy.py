@@ -30,6 +30,7 @@ __all__ = [
     "GridOptions",
     "OccupancyGrid",
     "grid_of_points",
+    "level_map",
     "make_occupancy_grid",
 ]
 
@@ -261,14 +262,18 @@ def level_map(version: MapVersion, T_base_camera: Array) -> MapVersion:
     )
     # 2. Find the nearest keyframe of each square that has points.
     points = version.points.astype(np.float64)
-    squares, square = np.unique(np.floor(points[:, :2] / _LEVEL_SQUARE_M), axis=0, return_inverse=True)
+    low = points[:, :2].min(axis=0, initial=0.0)
+    columns, rows = np.floor((points[:, :2] - low) / _LEVEL_SQUARE_M).astype(np.int64).T
+    width = int(columns.max(initial=0)) + 1
+    numbers, square = np.unique(rows * width + columns, return_inverse=True)
+    squares = np.column_stack([numbers % width, numbers // width])
     nearest = np.zeros(len(squares), dtype=np.int64)
     for first in range(0, len(squares), _SQUARES_AT_ONCE):
         part = slice(first, first + _SQUARES_AT_ONCE)
-        middles = (squares[part] + 0.5) * _LEVEL_SQUARE_M
+        middles = low + (squares[part] + 0.5) * _LEVEL_SQUARE_M
         nearest[part] = np.linalg.norm(middles[:, None] - T_world_base[:, :2, 3], axis=2).argmin(axis=1)
     # 3. Give each point its height above the base there.
-    heights = (T_world_level @ inverse(T_world_base))[:, 2][nearest[square.reshape(-1)]]
+    heights = (T_world_level @ inverse(T_world_base))[:, 2][nearest[square]]
     points[:, 2] = (heights[:, :3] * points).sum(axis=1) + heights[:, 3]
     return replace(version, keyframes=keyframes, points=points.astype(np.float32))
 
