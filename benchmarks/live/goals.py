@@ -91,7 +91,7 @@ async def _drive(
                 "--floor-plan-every-s=2", "--cloud-every-s=60",
                 *(["--map=hall"] if fault == "corrected" else []), "--ros-args", "-p", "use_sim_time:=true",
             )  # fmt: skip
-            ros2.start(ros2.python, str(EXAMPLES / "ros2_drive_to_goals.py"))
+            driver = ros2.start(ros2.python, str(EXAMPLES / "ros2_drive_to_goals.py"))
             carried = ["--carried", *map(str, range(goals))] if fault == "carried" else []
             simulator = ros2.start(
                 ros2.python, str(EXAMPLES / "ros2_simulated_robot.py"), "--building", building,
@@ -105,7 +105,10 @@ async def _drive(
                 if fault in ("kill", "network"):
                     await _break(platform, simulator, fault)
                 await _wait(simulator, f"goal {number} [rMG]")
-                say(_goals(simulator.lines)[-1].string.strip())
+                goal = _goals(simulator.lines)[-1]
+                say(goal.string.strip())
+                if goal[2] != "reached":
+                    say("".join(driver.lines[-5:]))
             if second is not None:
                 say(await second)
     finally:

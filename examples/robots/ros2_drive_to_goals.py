@@ -42,6 +42,7 @@ class Driver:
         self._status = "lost"
         self._navigator: Navigator | None = None
         self._planned_s = -math.inf
+        self._said = ""
 
     def _on_goal(self, message) -> None:
         at, turned = message.pose.position, message.pose.orientation
@@ -83,6 +84,10 @@ class Driver:
         if now_s >= self._planned_s + REPLAN_S:
             self._planned_s = now_s
             navigator.replan(plan, x_m, y_m)
+        trouble = "lost" if self._status == "lost" else "no path" if navigator.path is None else ""
+        if trouble != self._said:
+            self._said = trouble
+            print(f"{now_s:.1f} s: {trouble or 'on the way'} at x {x_m:.2f} m, y {y_m:.2f} m", flush=True)
         command = navigator.command(x_m, y_m, yaw_of(T_map_base), self._status)
         stamped = TwistStamped(header=message.header)
         stamped.twist.linear.x, stamped.twist.angular.z = command or (0.0, 0.0)

@@ -30,8 +30,8 @@ from tests.kit.documentation_pages import PAGES
 from tests.kit.removed_extensions import installed_commands, is_removed
 
 OTHER_PROGRAMS = (
-    "npx", "node", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
-    "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",
+    "npx", "node", "aws", "dask", "python", "sh", ".", "grep", "sudo", "g++", "cmake", "mkdir",
+    "build/first_pose", "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",
     "rse-pf-ros", "export", "pip", "python3.11", "ros2", "sleep", "umask", "curl", "kill",
 )  # fmt: skip
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
