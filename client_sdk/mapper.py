@@ -45,6 +45,7 @@ from client_sdk.pose_answers import AskPose
 from client_sdk.recording import RobotRecorder
 from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
 from client_sdk.tracking.monocular_tracker import MonocularTracker
+from client_sdk.tracking.segment_join import CONTRADICTED
 from client_sdk.tracking.segments import (
     DriveRecords,
     SegmentRecord,
@@ -375,11 +376,15 @@ class Mapper:
         """Noise of depths as measured during the drive; of a Kinect if the camera has no depth."""
         return self._tracker.noise.noise if isinstance(self._tracker, Tracker) else DepthNoise()
 
+    @property
+    def _contradicts_wheels(self) -> bool:
+        return isinstance(self._tracker, Tracker) and self._tracker.contradicts_wheels
+
     def carry(self, timestamp_s: float, odometry: Sequence[OdometryReading]) -> Array | None:
         """Add readings of the wheels, and return ``T_world_camera`` ``(4, 4)`` as they carry it to a time.
 
         *timestamp_s* is that of the next frame, in seconds, which is then tracked without these readings.
-        None if there is no pose, or the wheels do not tell the motion since.
+        None if there is no pose, or the wheels do not tell the motion since, or images contradict them.
 
         Raises:
             UsageError: As by `track`.
@@ -388,6 +393,8 @@ class Mapper:
         if self._wheels is not None:
             self._wheels.add(odometry)
         if self._wheels is None or self._tracker is None or self._tracker.last_pose is None:
+            return None
+        if self._contradicts_wheels:
             return None
         last_s, T_world_camera = self._tracker.last_pose
         motion = self._wheels.motion(last_s, timestamp_s)
@@ -697,7 +704,10 @@ class Mapper:
         return self._add_base(self._wheels, tracked)
 
     def _add_base(self, wheels: WheelOdometry, tracked: TrackedFrame) -> TrackedFrame:
-        """Return the result of a frame with the pose of the base, carried by the wheels if it has none."""
+        """Return the result of a frame with the pose of the base, carried by the wheels if it has none.
+
+        The wheels do not carry it if images show another place than they tell.
+        """
         tracker, pose, now_s = self._tracker, tracked.T_world_camera, tracked.frame.timestamp_s
         last = None if tracker is None else tracker.last_pose
         uncertainty = self._base_covariance
@@ -714,6 +724,8 @@ class Mapper:
         motion = None if last is None else wheels.motion(last[0], now_s)
         if last is None or motion is None:
             return tracked
+        if self._contradicts_wheels:
+            return replace(tracked, reason=CONTRADICTED)
         pose = orthonormalise(last[1] @ motion.T_camera_begin_end)
         T_world_base = wheels.base_pose(pose)
         return replace(

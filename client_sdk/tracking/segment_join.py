@@ -13,6 +13,7 @@ from client_sdk.wheel_odometry import WheelMotion
 from rse_pf.geometry import Array, pose_difference, rotation_angle_deg, transform
 
 __all__ = [
+    "CONTRADICTED",
     "NOT_JOINED",
     "REPEATED",
     "Join",
@@ -28,6 +29,8 @@ __all__ = [
 NOT_JOINED = "in a segment that is not joined to the first one yet"
 """`TrackedFrame.reason` of a frame that has a pose, but in the world of its own segment and not in that of
 the first segment."""
+CONTRADICTED = "the image shows another place than the wheels tell"
+"""`TrackedFrame.reason` of a frame without a pose: the robot was carried, or something hides the view."""
 REPEATED = "the image repeats while the wheels turn"
 """`TrackedFrame.reason` of a frame whose image is that of the frame before, although the wheels moved."""
 _MAX_JOIN_DIFFERENCE_M = 0.15

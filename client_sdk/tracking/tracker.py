@@ -279,6 +279,11 @@ class Tracker:
         """
         return self._state.unrecognised
 
+    @property
+    def contradicts_wheels(self) -> bool:
+        """Whether images show another place than the wheels tell: they do not carry the pose there."""
+        return self._state.contradictions >= carried_segment_after(self.options.segment_after)
+
     def restart(self, T_world_start: Array, timestamp_s: float | None = None) -> None:
         """Forget all segments: the next frame with enough features begins segment 0 at *T_world_start*.
 
@@ -863,7 +868,7 @@ class Tracker:
                 contradictions=self._state.contradictions + is_elsewhere,
             )
             after = self.options.segment_after
-            if is_elsewhere := self._state.contradictions >= carried_segment_after(after):
+            if is_elsewhere := self.contradicts_wheels:
                 motion = None
             if self._state.unrecognised <= (after if motion is None else carried_segment_after(after)):
                 return self._lose(match_count)

@@ -158,9 +158,10 @@ class Robot:
         return self.time_s - begin_s
 
     def carry_away(self, rng: np.random.Generator) -> None:
-        """Put the robot into another place of the building; its wheels do not notice."""
-        y_m, x_m = rng.permutation(np.argwhere(self._building.is_free))[0] + 0.5
-        self.base = DifferentialBase(self._building, float(x_m), float(y_m), rng.uniform(-math.pi, math.pi))
+        """Put the robot at another place of the tour, in any direction; its wheels do not notice."""
+        poses = self._tour.T_building_base
+        x_m, y_m = poses[rng.integers(len(poses)), :2, 3].tolist()
+        self.base = DifferentialBase(self._building, x_m, y_m, rng.uniform(-math.pi, math.pi))
 
     def goal(self, rng: np.random.Generator) -> Array:
         """Return a random free place of the building, in the map."""
