@@ -60,3 +60,4 @@ trap 'rm -rf "$built"' EXIT
 ) > "$place/tf2_msgs.log" 2>&1 || left_out "the transforms' message could not be built: see build/ros2/tf2_msgs.log"
 "$place/bin/python" -c 'import rclpy, tf2_msgs.msg' || left_out "rclpy cannot be imported"
 echo "$wanted" > "$place/installed"
+echo "ros: ready: . build/ros2/bin/activate"

@@ -131,12 +131,14 @@ class Navigator:
 
     def command(self, x_m: float, y_m: float, yaw_rad: float, status: str) -> tuple[float, float] | None:
         """Return forward speed (m/s) and turn rate (rad/s); None at the goal."""
+        if status == "lost":
+            return 0.0, 0.5 * MAX_TURN_RATE_RAD_S  # look around for a known place
         left_m = math.hypot(self.goal[0] - x_m, self.goal[1] - y_m)
         if left_m < ARRIVED_M or (self.path is not None and len(self.path) == 1):
             angle = math.remainder(self.goal[2] - yaw_rad, 2.0 * math.pi)
             return None if abs(angle) < ARRIVED_RAD else (0.0, float(np.clip(2.0 * angle, -0.6, 0.6)))
-        if status == "lost" or self.path is None:
-            return 0.0, 0.5 * MAX_TURN_RATE_RAD_S  # look around: for a known place, or a gap in the plan
+        if self.path is None:
+            return 0.0, 0.5 * MAX_TURN_RATE_RAD_S  # look around: the plan may have a gap
         nearest = int(np.argmin(np.hypot(self.path[:, 0] - x_m, self.path[:, 1] - y_m)))
         along = np.cumsum(np.linalg.norm(np.diff(self.path[nearest:], axis=0), axis=1))
         ahead = nearest + int(np.searchsorted(along, LOOK_AHEAD_M)) + 1

@@ -4,6 +4,7 @@ A small stand-in for Nav2: it reads /tf, /odom, /rse_pf/floor_plan and /rse_pf/s
 Needs a ROS 2 (rclpy); pip install 'rse-pf[ros2]' installs one.
 """
 
+import argparse
 import math
 import sys
 
@@ -13,6 +14,7 @@ from drive_to_goals import Navigator, yaw_of
 from rse_pf.geometry import Array
 from rse_pf.slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
+parser = argparse.ArgumentParser(description=__doc__)
 REPLAN_S = 2.0  # time from one path to the next, in seconds of the clock of ROS
 
 
@@ -75,7 +77,11 @@ class Driver:
         from std_msgs.msg import Bool
 
         navigator, plan = self._navigator, self._plan
-        if navigator is None or plan is None or self._T_map_odom is None:
+        if navigator is None:
+            self._say("waiting for a goal on /goal_pose")
+            return
+        if plan is None or self._T_map_odom is None:
+            self._say("waiting for /rse_pf/floor_plan, and for map -> odom on /tf")
             return
         pose, stamp = message.pose.pose, message.header.stamp
         T_map_base = self._T_map_odom @ pose_of(pose.position, pose.orientation)
@@ -84,17 +90,22 @@ class Driver:
         if now_s >= self._planned_s + REPLAN_S:
             self._planned_s = now_s
             navigator.replan(plan, x_m, y_m)
-        trouble = "lost" if self._status == "lost" else "no path" if navigator.path is None else ""
-        if trouble != self._said:
-            self._said = trouble
-            print(f"{now_s:.1f} s: {trouble or 'on the way'} at x {x_m:.2f} m, y {y_m:.2f} m", flush=True)
+        state = "lost" if self._status == "lost" else "no path" if navigator.path is None else "on the way"
+        self._say(f"{state} to x {navigator.goal[0]:.2f} m, y {navigator.goal[1]:.2f} m")
         command = navigator.command(x_m, y_m, yaw_of(T_map_base), self._status)
         stamped = TwistStamped(header=message.header)
         stamped.twist.linear.x, stamped.twist.angular.z = command or (0.0, 0.0)
         self._commands.publish(stamped)
         if command is None:
             self._navigator = None
+            self._say("the goal is reached")
             self._reached.publish(Bool(data=True))
+
+    def _say(self, sentence: str) -> None:
+        """Print a sentence if it is another one than before."""
+        if sentence != self._said:
+            self._said = sentence
+            print(sentence, flush=True)
 
 
 def pose_of(position, orientation) -> Array:
@@ -115,6 +126,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    parser.parse_args()
     try:
         main()
     except KeyboardInterrupt:

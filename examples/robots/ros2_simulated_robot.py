@@ -110,6 +110,7 @@ class Robot:
         while not all(each.get_subscription_count() for each in waited):
             self._publish_clock()
             self._spin_once(self.node, timeout_sec=0.1)
+        print("a bridge takes the images: the tour begins", flush=True)
 
     def drive_tour(self, length_m: float) -> None:
         """Drive a length of the tour, as somebody with a joystick would."""
