@@ -103,6 +103,7 @@ class Mapper:
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
         T_base_camera: Array | None = None,
+        planar: bool = False,
         keyframes_of: str = "",
         adds_frames: bool = True,
         recorder: RobotRecorder | None = None,
@@ -130,6 +131,9 @@ class Mapper:
             T_base_camera: ``(4, 4)`` mount of the camera on the robot's base, metres; x of the base is ahead,
                 z up.  With it the world is the frame of the base at the first image, unless *T_world_start*
                 or an IMU gives another one, and `track` takes wheel odometry.
+            planar: Whether the base stays in the plane z = 0 of the world, without roll and pitch: on one
+                floor without ramps.  Poses of a camera with depth then keep to it.  Needs *T_base_camera*;
+                a world by *T_world_start* or an IMU has no such plane.
             keyframes_of: Name of the robot whose keyframes are kept for `encoded_map`, about 50 kB each.
                 Empty: none is kept.
             adds_frames: Whether each frame with depth is added to the map.  With False the caller adds
@@ -143,8 +147,8 @@ class Mapper:
             optimiser: Function for the bundle adjustment of a camera without depth; None: the built-in one.
 
         Raises:
-            UsageError: An argument that must be a function is none, *features* has no name, or
-                *T_base_camera* is no pose.
+            UsageError: An argument that must be a function is none, *features* has no name,
+                *T_base_camera* is no pose, or *planar* has no *T_base_camera*.
         """
         self.camera = camera
         """Intrinsics of all frames: the argument *camera*, else those of the first frame, and None before."""
@@ -169,7 +173,13 @@ class Mapper:
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
         self._recorder = recorder
+        if planar and T_base_camera is None:
+            raise UsageError(
+                "planar says how the base moves, and the mount of the camera is not known",
+                hint="give T_base_camera, too",
+            )
         self._wheels = None if T_base_camera is None else WheelOdometry(T_base_camera)
+        self._is_planar = planar
         self._base_covariance = BaseCovariance()
         self._newest_segment, self._last_visual_s = 0, float("-inf")
         self._image, self._image_s = b"", float("-inf")  # the newest image, and when it came first
@@ -658,6 +668,7 @@ class Mapper:
                 self._start_imu(frame.imu, frame.camera)
             elif self._T_world_start is None and self._wheels is not None:
                 self._T_world_start, self._is_upright = self._wheels.T_base_camera, True
+                self._wheels.is_planar = self._is_planar
             has_depth = bool(frame.depth_m.any()) if self._uses_depth is None else self._uses_depth
             if frame.stereo is not None or has_depth:
                 self._depth_source = "depth" if frame.stereo is None else "stereo"

@@ -472,6 +472,10 @@ class Plugins:
         """Return the motion by the wheels between two times, in seconds; None if they do not tell it."""
         return None if self.wheels is None else self.wheels.motion(begin_s, end_s)
 
+    def on_plane(self, T_world_camera: Array) -> Array:
+        """Return the pose ``(4, 4)`` with the base of a planar robot in its plane; others are unchanged."""
+        return T_world_camera if self.wheels is None else self.wheels.on_plane(T_world_camera)
+
     def add_pose(self, timestamp_s: float, T_world_camera: Array) -> None:
         """Store the pose of a tracked frame, from which the user's motion model predicts later poses."""
         if self.motion is not None:

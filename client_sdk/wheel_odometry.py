@@ -14,7 +14,7 @@ import numpy as np
 
 from client_sdk.wheel_check import WheelCheck
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, inverse, orthonormalise, rigid, rotation_angle_deg, skew
+from rse_pf.geometry import Array, inverse, orthonormalise, planar_pose, rigid, rotation_angle_deg, skew
 
 __all__ = ["BaseCovariance", "OdometryReading", "WheelMotion", "WheelOdometry"]
 
@@ -123,6 +123,7 @@ class WheelOdometry:
 
     Attributes:
         T_base_camera: ``(4, 4)``, metres: mount of the camera on the base.
+        is_planar: Whether the base stays in the plane z = 0 of the world.
     """
 
     def __init__(self, T_base_camera: Array) -> None:
@@ -137,6 +138,7 @@ class WheelOdometry:
                 "T_base_camera is no pose", hint="give a (4, 4) matrix: a rotation, metres, and 0 0 0 1"
             )
         self.T_base_camera: Array = mount
+        self.is_planar = False
         self._check = WheelCheck()
         self._T_camera_base = inverse(mount)
         self._count = 0
@@ -257,6 +259,15 @@ class WheelOdometry:
         """Return ``T_world_base`` ``(4, 4)`` of a pose of the camera, in metres."""
         T_world_base: Array = T_world_camera @ self._T_camera_base
         return T_world_base
+
+    def on_plane(self, T_world_camera: Array) -> Array:
+        """Return the pose ``(4, 4)`` of the camera, metres, whose base is in the plane if it stays in one."""
+        if not self.is_planar:
+            return T_world_camera
+        base = self.base_pose(T_world_camera)
+        yaw_rad = math.atan2(base[1, 0], base[0, 0])
+        pose: Array = planar_pose(base[0, 3], base[1, 3], yaw_rad) @ self.T_base_camera
+        return pose
 
 
 class BaseCovariance:

@@ -638,7 +638,10 @@ async def connected_bridge(
             keeps_keyframes = options.publish_as or options.floor_plan_every_s
             name = (options.namespace.strip("/") or "robot") if keeps_keyframes else ""
             is_deep = options.partner == "depth"
-            yield robot.mapper(depth=is_deep, keyframes_of=name, T_base_camera=T_base_camera)
+            is_planar = options.planar and T_base_camera is not None
+            yield robot.mapper(
+                depth=is_deep, keyframes_of=name, T_base_camera=T_base_camera, planar=is_planar
+            )
 
         bridge = Bridge(open_mapper, options, publish, is_ros1=is_ros1, robot=robot, now_ns=now_ns)
         try:

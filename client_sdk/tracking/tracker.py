@@ -766,7 +766,7 @@ class Tracker:
         landmarks[matches.features[inliers]] = matches.numbers[inliers]
         return PosedView(
             view=view,
-            T_world_camera=T_world_camera,
+            T_world_camera=self._plugins.on_plane(T_world_camera),
             landmarks=landmarks,
             inliers=len(inliers),
             matches=max(len(attempt.matches), len(matches)),

@@ -98,6 +98,19 @@ async def test_the_world_is_the_frame_of_the_base_at_the_first_image() -> None:
     assert second.pose_source == "visual"
 
 
+async def test_a_planar_base_stays_in_its_plane_and_needs_a_mount() -> None:
+    with pytest.raises(UsageError) as refused:
+        Mapper(ask=solve, planar=True)
+    assert refused.value.hint
+
+    mapper = Mapper(ask=solve, T_base_camera=MOUNT, planar=True)
+    tracked = [await mapper.track(frame_at(row, depth=True)) for row in range(6)]
+
+    poses = np.array([each.T_world_base for each in tracked])
+    np.testing.assert_allclose(poses[:, 2], np.tile([0.0, 0.0, 1.0, 0.0], (6, 1)), atol=1e-12)
+    np.testing.assert_allclose(poses[:, 1, 3], -STEP_M * np.arange(6), atol=0.01)
+
+
 def test_a_covered_lens_is_carried_by_the_wheels_and_seen_again_at_once() -> None:
     drive = covered(short_drive(), 20, 40)
     mapper = Mapper(ask=solve, T_base_camera=T_BASE_CAMERA)
