@@ -44,6 +44,8 @@ _DRIFT_RAD = math.radians(0.3)
 the distance since the last correction."""
 _CLEAR_MOTION_M = 0.01  # a camera that moved by this length, in metres, does not take the same image again
 _CLEAR_MOTION_RAD = 0.01  # a camera that turned by this angle, in rad, does not take the same image again
+_STILL_M = 0.1  # a camera that moved by less, in metres, still sees most of what it saw
+_STILL_RAD = 0.1  # a camera that turned by less, in rad, still sees most of what it saw
 _MIN_STEP_M = 0.02
 """Shortest step, in metres, that counts for the distance of a tracked camera: the noise of the poses of a
 stationary one is below it."""
@@ -101,6 +103,11 @@ class WheelMotion:
     def is_clear(self) -> bool:
         """Whether the base has moved: an image must have changed."""
         return self.length_m >= _CLEAR_MOTION_M or self.angle_rad >= _CLEAR_MOTION_RAD
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the camera still sees most of what it saw at the begin."""
+        return self.length_m < _STILL_M and self.angle_rad < _STILL_RAD
 
     @property
     def reach_m(self) -> float:

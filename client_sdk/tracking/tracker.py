@@ -121,7 +121,7 @@ class _TrackState:
         lost_in_a_row: Number of frames without a pose since the last accepted one.
         unrecognised: Number of frames since the last accepted pose that show enough features and no known
             place.
-        contradictions: The number of these that by the wheels would still show half of what was seen then.
+        contradictions: The number of these at which the wheels had hardly moved since that pose.
         segment: Number of the present segment, -1 before the first.
         join_candidate: Where the present segment may lie in another one; None without a measurement.
     """
@@ -849,9 +849,8 @@ class Tracker:
         depth.  A later one begins at the last accepted pose, with a frame of at least three times as many
         features with depth, once more than ``segment_after`` such frames without a pose came since then.
         Where wheels have carried the pose, it begins there, and earlier; frames whose queries nobody has
-        answered do not count.  If images show another place although by the wheels the camera still sees half
-        of what it saw, the robot was carried away, or something hides the view: the wheels do not tell then
-        where the segment begins.
+        answered do not count.  If images show another place while the wheels stand still, the robot was
+        carried away, or something hides the view: the wheels do not tell then where the segment begins.
         """
         feature_count = int(np.isfinite(view.features.points_camera[:, 2]).sum())
         factor = _BEGIN_DEPTHS_FACTOR if self._segments else 1
@@ -861,7 +860,7 @@ class Tracker:
         if self._segments:
             if motion is not None and self._has_missing_answer:
                 return self._lose(match_count)
-            is_elsewhere = motion is not None and self._sees_half_after(motion, view)
+            is_elsewhere = motion is not None and motion.is_still
             self._state = replace(
                 self._state,
                 unrecognised=self._state.unrecognised + 1,
@@ -877,13 +876,6 @@ class Tracker:
         if is_elsewhere:
             self._elsewhere.add(self._next_segment)
         return self._begin_segment(view, start, feature_count, motion)
-
-    def _sees_half_after(self, motion: WheelMotion, view: View) -> bool:
-        """Return whether after a motion the camera would still see half of what it saw before."""
-        camera = self._frame.camera
-        field_rad = 2.0 * math.atan(0.5 * camera.width / camera.fx)
-        distance_m = float(np.nanmedian(view.features.points_camera[:, 2]))
-        return motion.angle_rad <= 0.5 * field_rad and motion.length_m <= 0.5 * distance_m
 
     def _begin_segment(
         self, view: View, T_world_camera: Array, feature_count: int, motion: WheelMotion | None

@@ -33,6 +33,7 @@ CAMERA_FRAME = "camera_color_optical_frame"
 START_S = 10.0  # time of the first image: a time of 0 means in ROS that there is no clock yet
 ANSWER_WAIT_S = 1.0  # longest wait for a pose and a command, in real seconds
 COMMAND_S = 0.5  # a command with an older stamp stops the robot, as the drivers of real bases do
+PUT_DOWN_S = 3.0  # simulated time for which a robot that was carried stands before it gets a goal
 GOAL_S = 150.0  # longest simulated time for a goal
 REACHED_M, REACHED_DEG = 0.15, 10.0  # largest true errors of position and direction at a goal that is reached
 WRONG_M = 0.2  # a pose by the camera with a larger error is counted as wrong
@@ -159,10 +160,15 @@ class Robot:
         return self.time_s - begin_s
 
     def carry_away(self, rng: np.random.Generator) -> None:
-        """Put the robot at another place of the tour, in any direction; its wheels do not notice."""
+        """Put the robot at another place of the tour, in any direction, where it stands for a while.
+
+        Its wheels do not notice.
+        """
         poses = self._tour.T_building_base
         x_m, y_m = poses[rng.integers(len(poses)), :2, 3].tolist()
         self.base = DifferentialBase(self._building, x_m, y_m, rng.uniform(-math.pi, math.pi))
+        for _ in range(round(PUT_DOWN_S / STEP_S)):
+            self._advance(*self.base.step(0.0, 0.0))
 
     def goal(self, rng: np.random.Generator) -> Array:
         """Return a random free place of the building, in the map."""

@@ -32,7 +32,7 @@ async def test_a_robot_reaches_goals_by_the_floor_plan_and_the_poses_of_the_brid
         ros2.start(ros2.python, str(EXAMPLES / "ros2_drive_to_goals.py"))
         robot = ros2.start(
             ros2.python, str(EXAMPLES / "ros2_simulated_robot.py"),
-            "--building", "rooms", "--tour", "5", "--goals", "1",
+            "--building", "rooms", "--tour", "20", "--goals", "1",
         )  # fmt: skip
         await asyncio.to_thread(
             robot.until, lambda lines: any("of 1 goals" in line for line in lines), GOAL_TIMEOUT_S
