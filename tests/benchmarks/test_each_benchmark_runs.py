@@ -133,4 +133,6 @@ def test_each_benchmark_is_tried_here() -> None:
     )
 
     names = {line.split()[0] for line in listed.stdout.splitlines()}
-    assert names == {*RUNS, *RUNS_ON_RECORDINGS, "live.many", "maps.twins", "server.peer"}
+    assert names == {
+        *RUNS, *RUNS_ON_RECORDINGS, "live.goals", "live.many", "maps.twins", "server.peer",
+    }  # fmt: skip
