@@ -7,9 +7,10 @@ The programs are those of examples/robots: ``ros2_simulated_robot.py`` renders w
 the bridge.  After a tour through the building that makes the map, each goal is a random place and direction.
 
 ``--fault`` happens once for each goal, soon after it was sent: ``kill`` kills the server of the robot,
-``network`` stops the balancer for 10 s of the simulated time, and ``carried`` puts the robot into another
-place before the goal is sent, without a turn of its wheels.  With ``corrected`` a second robot, of the SDK,
-drives through the building from the first goal on, in a live map of both.
+``network`` stops the balancer for 10 s of the simulated time, and ``carried`` puts the robot at another place
+of the tour, without a turn of its wheels, where it stands for 3 s before the goal is sent.  With
+``corrected`` a second robot, of the SDK, drives through the building from the first goal on, in a live map
+of both.
 
 A goal is reached if the robot says so within 150 s and stands within 15 cm and 10 degrees of it.  A pose is
 wrong if the bridge calls it ``visual`` and it is more than 20 cm off, in a map that is laid over the building

@@ -860,14 +860,15 @@ class Tracker:
         if self._segments:
             if motion is not None and self._has_missing_answer:
                 return self._lose(match_count)
-            is_elsewhere = motion is not None and motion.is_still
+            is_still = motion is not None and motion.is_still
             self._state = replace(
                 self._state,
                 unrecognised=self._state.unrecognised + 1,
-                contradictions=self._state.contradictions + is_elsewhere,
+                contradictions=self._state.contradictions + is_still,
             )
             after = self.options.segment_after
-            if is_elsewhere := self.contradicts_wheels:
+            is_elsewhere = self.contradicts_wheels
+            if is_elsewhere:
                 motion = None
             if self._state.unrecognised <= (after if motion is None else carried_segment_after(after)):
                 return self._lose(match_count)

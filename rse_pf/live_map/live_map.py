@@ -392,7 +392,7 @@ class LiveMap:
     ) -> Callable[[], Localised]:
         """Return a function that does the work of `relocalise`, in any thread while the map changes.
 
-        With a *prior*, half of the keyframes that are compared are those near it, if there are so many.
+        With a *prior*, half of the keyframes that are compared lie near it; fewer if the map has fewer there.
 
         Raises:
             BadRequest: The descriptors of *view* are of another kind than those of the map.

@@ -68,10 +68,10 @@ _GUIDED_FLOOR_DEG = 0.3
 common; its square is added to the variance of a guided search."""
 _MAX_PRIOR_SIGMAS = 3.0
 """Largest distance of an expected pose from its prior, in standard deviations."""
-_PRIOR_FLOOR_M = 0.2
+_PRIOR_MARGIN_M = 0.2
 """Standard deviation along each axis, in metres, that is added to a prior: a planar one states none of the
 height."""
-_PRIOR_FLOOR_DEG = 5.0  # standard deviation about each axis, in degrees, that is added to a prior
+_PRIOR_MARGIN_DEG = 5.0  # standard deviation about each axis, in degrees, that is added to a prior
 _MAX_PRIOR_VARIANCE = 1e12  # largest element of the covariance of a prior, m^2: larger than any map
 _MAX_PRIOR_ROUNDING = 1e-6  # largest negative eigenvalue of a covariance that counts as rounding
 _MIN_EXPECTED_SHARE = 0.5
@@ -155,9 +155,11 @@ class PosePrior:
         """
         turns = log_se3(T_map_cameras @ inverse(self.T_map_camera))[:, 3:]
         apart = np.hstack((T_map_cameras[:, :3, 3] - self.T_map_camera[:3, 3], turns))
-        length_m = _PRIOR_FLOOR_M**2 + (reach_m / _MAX_PRIOR_SIGMAS) ** 2
-        angle_deg2 = _PRIOR_FLOOR_DEG**2 + (reach_deg / _MAX_PRIOR_SIGMAS) ** 2
-        covariance = self.covariance + np.diag([length_m] * 3 + [math.radians(1.0) ** 2 * angle_deg2] * 3)
+        variance_m2 = _PRIOR_MARGIN_M**2 + (reach_m / _MAX_PRIOR_SIGMAS) ** 2
+        variance_deg2 = _PRIOR_MARGIN_DEG**2 + (reach_deg / _MAX_PRIOR_SIGMAS) ** 2
+        covariance = self.covariance + np.diag(
+            [variance_m2] * 3 + [math.radians(1.0) ** 2 * variance_deg2] * 3
+        )
         sigmas2 = np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart.T).T)
         is_within: npt.NDArray[np.bool_] = sigmas2 <= _MAX_PRIOR_SIGMAS**2
         return is_within
