@@ -25,7 +25,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper
 from client_sdk.robot import Robot
-from client_sdk.tracking.segment_join import NOT_JOINED
+from client_sdk.tracking.segment_join import CONTRADICTED, NOT_JOINED
 from client_sdk.wheel_odometry import OdometryReading
 from ros_bridge.access import connect_robot
 from ros_bridge.base_poses import BasePoses
@@ -306,7 +306,7 @@ class Bridge:
         del self.track_s[:-10_000]
         self.frames += 1
         self._stamp_ns, self._frame_s = images.stamp_ns, self._clock()
-        self._is_elsewhere = tracked.reason == NOT_JOINED
+        self._is_elsewhere = tracked.reason in (CONTRADICTED, NOT_JOINED)
         is_visual = tracked.pose_source == "visual" and not self._is_elsewhere
         self._reason = "" if is_visual else tracked.reason
         self.lost_frames += not is_visual
