@@ -58,3 +58,5 @@ if __name__ == "__main__":
         main(parser.parse_args())
     except KeyboardInterrupt:
         sys.exit(130)
+    except ModuleNotFoundError as error:
+        sys.exit(f"{error.name} is not installed: see docs/ros.md, or source the setup.bash of your ROS 2")

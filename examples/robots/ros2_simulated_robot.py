@@ -34,6 +34,7 @@ START_S = 10.0  # time of the first image: a time of 0 means in ROS that there i
 ANSWER_WAIT_S = 1.0  # longest wait for a pose and a command, in real seconds
 COMMAND_S = 0.5  # a command with an older stamp stops the robot, as the drivers of real bases do
 PUT_DOWN_S = 3.0  # simulated time for which a robot that was carried stands before it gets a goal
+LEAST_TOUR_M = 5.0  # shortest tour whose path tells how the map is turned
 GOAL_S = 150.0  # longest simulated time for a goal
 REACHED_M, REACHED_DEG = 0.15, 10.0  # largest true errors of position and direction at a goal that is reached
 WRONG_M = 0.2  # a pose by the camera with a larger error is counted as wrong
@@ -130,6 +131,8 @@ class Robot:
     def find_map(self) -> None:
         """Find where the map lies in the building by the newest path, which has all corrections."""
         stamps = sorted(self._path.keys() & self._truths.keys())
+        if len(stamps) < 2:
+            sys.exit("no path came on /rse_pf/path: read /diagnostics of the bridge, which says why")
         in_map = np.array([self._path[each] for each in stamps])
         in_building = np.array([self._truths[each][:2, 3] for each in stamps])
         to_map, to_building = in_map - in_map.mean(0), in_building - in_building.mean(0)
@@ -321,7 +324,17 @@ def main(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
+    given = parser.parse_args()
+    if not given.tour >= LEAST_TOUR_M:
+        parser.error(f"--tour {given.tour:g} m is too short to make a map: at least {LEAST_TOUR_M:g} m")
+    for name in ("goals", "seed"):
+        if getattr(given, name) < 0:
+            parser.error(f"--{name} {getattr(given, name):g} is negative: name 0 or more")
+    if unknown := [number for number in given.carried if not 0 <= number < given.goals]:
+        parser.error(f"--carried {unknown[0]}: there is no such goal, they are 0 to {given.goals - 1}")
     try:
-        main(parser.parse_args())
+        main(given)
     except KeyboardInterrupt:
         sys.exit(130)
+    except ModuleNotFoundError as error:
+        sys.exit(f"{error.name} is not installed: see docs/ros.md, or source the setup.bash of your ROS 2")
